@@ -9,16 +9,20 @@ WORKERS ?= 2
 export PATH
 # Threads that spin at barriers for long slow each other down tenfold beside any other program.
 export GOMP_SPINCOUNT := 20000
+# Without bytecode, every process compiles PyTorch's sources anew, which doubles its start.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help install quickstart test check docs bench build cards clean
+.PHONY: help install demo ship quickstart test check docs bench build cards clean
 
 help:
+	@echo "make demo         install, then let the policy that ships with egovcp play all tasks (1 min)"
 	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (10 to 20 min)"
 	@echo "make test         the test suite"
 	@echo "make check        linter, formatter, type checker, lock file, docs"
 	@echo "make docs         the documentation site, in site/"
 	@echo "make bench        benchmarks, ratios measured side by side"
 	@echo "make cards        dataset_cards/ from a dataset of 1000 episodes of each task (collected if need be)"
+	@echo "make ship         the policy that ships with egovcp: make ship FROM=runs/contact/checkpoints/last/pretrained_model"
 	@echo "make build        wheels and source distributions of every package into dist/"
 
 install: .venv/installed
@@ -30,23 +34,28 @@ install: .venv/installed
 test: install
 	pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder -m "not slow and not gpu"
 
-# Laptop scale: the throw comes at once, so that each simulated second teaches something, and the
-# robot stands by the stance law, which is cheaper to simulate and keeps the camera still. Hands
-# that stay for a while where the walk puts them show what that is worth.
-WALK := --eta=1 --step_ticks="[5,15]"
-SCENES := --env.controller=stance --env.ball_episode.ticks=46 --env.ball_episode.event_ticks="[4,10]"
+demo: install
+	rm -rf outputs/demo
+	egovcp-demo --output_dir=outputs/demo
+
+# Its card names it `contact` in this folder.
+ship: install
+	@test -f "$(FROM)/manifest.json" || { echo "ship: error: FROM=$(FROM): expected the folder of a policy" >&2; exit 2; }
+	rm -rf egovcp/pretrained/contact
+	egovcp-export --format=float16 --policy.path="$(FROM)" --output_dir=egovcp/pretrained/contact
+
 POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 
 quickstart: install
 	@test ! -e $(OUT) || { echo "quickstart: error: $(OUT) exists; remove it or choose another: make quickstart OUT=..." >&2; exit 2; }
 	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --episodes=5000 --seed=0 $(WALK) $(SCENES)
+	  --episodes=4000 --seed=0
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
 	  --output_dir=$(OUT)/policy --preset=laptop --seed=0
 	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 \
-	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
+	  --output_dir=$(OUT)/eval | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \
-	  --output_dir=$(OUT)/rollouts $(SCENES) --env.ball_episode.empty_probability=0
+	  --output_dir=$(OUT)/rollouts
 	@cd $(OUT) && for kind in mcap rrd png gif; do cp rollouts/rollout-0.$$kind rollout.$$kind; done
 	@echo; cat $(OUT)/table.txt; echo
 	@echo "dataset   $(OUT)/dataset          lerobot-dataset-viz --repo-id me/egovcp-ball --root $(OUT)/dataset --episode-index 0"

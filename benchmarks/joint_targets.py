@@ -19,7 +19,8 @@ from egovcp.sim.config import evaluation_config
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import EnvPolicy, Oracle, RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import JOINT_NAMES, TASKS
+from egovcp.sim.tasks import task_names
+from egovcp.spec import JOINT_NAMES
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def main() -> None:
     below = np.full(len(JOINT_NAMES), -np.inf)
     above = below.copy()
     for which in ("walk", "stance"):
-        for task in TASKS:
+        for task in task_names(training=True):
             for policy in (RandomWalk(), Oracle()):
                 found = excess(which, task, policy, args.robots, args.seed)
                 below, above = np.maximum(below, found[0]), np.maximum(above, found[1])

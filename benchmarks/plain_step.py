@@ -69,6 +69,8 @@ class PlainModel(nn.Module):
         self.decode_state = mlp(model.decode_state)
         self.termination = mlp(model.termination_head)
         self.value = mlp(model.value_head)
+        assert model.object_head is not None
+        self.object = mlp(model.object_head)
         for name, buffer in model.named_buffers():
             self.register_buffer(name, buffer.clone())
 
@@ -150,12 +152,14 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
 
     weight = pixel_weights(near, batch, loss)
     error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
+    values = value_terms(model, h, z, batch)
     foreseen = multistep_terms(model, (h, z), near, state, weight, batch, generator)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
         loss.state * mean_where(error, batch.valid),
+        loss.object * object_loss(model, features, batch.object, batch.valid & batch.object_known),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
-        *value_terms(model, h, z, batch),
+        *values,
         *foreseen,
     ]
     return torch.stack(terms).sum()
@@ -175,6 +179,11 @@ def depth_loss(
     error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
     error = error * weight[:, chosen].flatten(0, 1)
     return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
+
+
+def object_loss(model: PlainModel, features: Tensor, state: Tensor, known: Tensor) -> Tensor:
+    target = ((state - model.object_mean) / model.object_std).clamp(-5, 5)  # type: ignore[operator]
+    return mean_where((0.5 * (model.object(features) - target) ** 2).mean(-1), known)
 
 
 def kl_terms(
@@ -207,8 +216,8 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
     loss = model.config.loss
     target = (batch.mc_return - model.return_mean) / model.return_std  # type: ignore[operator]
     usable = batch.valid & batch.mc_valid
-    q = model.value(torch.cat([h, z, batch.action], -1))
-    value = mean_where(value_error(q, target), usable)
+    filtered = torch.cat([h, z, batch.action], -1)
+    value = mean_where(value_error(model.value(filtered), target), usable)
     h = model.transition(h, z, batch.action)
     z = model.gaussian(model.prior(h))[0]
     fall = F.binary_cross_entropy_with_logits(
@@ -216,9 +225,9 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
         batch.terminal_next.float(),
         reduction="none",
     )
-    q = model.value(torch.cat([h[:, :-1], z[:, :-1], batch.action[:, 1:]], -1))
-    error = value_error(q, target[:, 1:])
-    imagined = mean_where(error, usable[:, 1:] & unbroken(batch, 1))
+    ahead = torch.cat([h[:, :-1], z[:, :-1], batch.action[:, 1:]], -1)
+    known = usable[:, 1:] & unbroken(batch, 1)
+    imagined = mean_where(value_error(model.value(ahead), target[:, 1:]), known)
     return [
         loss.value * value,
         loss.termination * mean_where(fall, batch.valid),
@@ -258,6 +267,8 @@ def multistep_terms(
     return [
         loss.multistep_depth * mean_where(depth, valid),
         loss.multistep_state * mean_where(proprioception, valid),
+        loss.multistep_object
+        * object_loss(model, features, batch.object[:, at], valid & batch.object_known[:, at]),
     ]
 
 

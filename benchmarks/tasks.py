@@ -6,11 +6,11 @@ arch's clearance among them, and the wall at one push speed after another with `
 Prints success and reward per step with 95 % intervals, falls, and the way: 0 % is the reward of
 `random`, 100 % that of `oracle`. A task is well set for a controller when hands at rest mostly fail
 and go at most half of the way, and the oracle almost always succeeds; the last line says for which
-pushes that is so. Run it whenever the controller changes, and put the range into
-`egovcp.sim.config`:
+pushes that is so. For the wall it also prints how often the oracle stands with free hands after the
+push. Run it whenever the controller changes, and put the range of pushes into `egovcp.sim.config`:
 
-    python benchmarks/tasks.py --controller stance
-    python benchmarks/tasks.py --controller walk --pushes
+    python benchmarks/tasks.py
+    python benchmarks/tasks.py --tasks ball arch wall --pushes
 """
 
 from __future__ import annotations
@@ -20,12 +20,16 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import batched
 
+import numpy as np
 from report import parser, publish
 
 from egovcp.intervals import Interval, wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
+from egovcp.spec import PLANNER_DT
 from egovcp_deploy.controllers import Action, search_constant
 from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.options import held_out
@@ -36,6 +40,7 @@ PUSHED = ("hold", "oracle")  # for the wall at one push speed after another
 BANDS = {"default": (1.16, 1.24), "low": (1.08, 1.16)}
 MOST_AT_REST, LEAST_BY_ORACLE = 0.2, 0.9
 ENVS = 10
+RELEASE_S, NEUTRAL_M = 2.0, 0.10
 
 
 @dataclass(frozen=True)
@@ -94,6 +99,25 @@ def _play(pool: EpisodePool, groups: Sequence[EpisodeGroup]) -> list[EpisodeScor
     """Scores in the order of the groups' scenarios."""
     parts = dict(pool.play(groups))
     return [score for i in sorted(parts) for score in parts[i]]
+
+
+def released(env_config: EnvConfig, episodes: int, seed: int) -> float:
+    """Share of the wall's scenarios in which the oracle releases the wall and stays up.
+
+    Both hands must be within `NEUTRAL_M` of their start `RELEASE_S` after the disturbance.
+    """
+    env = VectorEnv(env_config, episodes, render_depth=False)
+    env.reset([held_out("wall", seed, i) for i in range(episodes)])
+    oracle, start = Oracle(), env.privileged_state().hands_b
+    due = env_config.wall.disturbed_time + RELEASE_S
+    free = np.zeros(episodes, np.bool_)
+    while not env.done.all():
+        result = env.step(oracle.act(env))
+        state = env.privileged_state()
+        away = np.linalg.norm(state.hands_b - start, axis=-1).max(axis=-1)
+        now = np.abs(state.since_event - due) < PLANNER_DT / 2
+        free[now] = away[now] < NEUTRAL_M
+    return float(np.mean(free & ~result.terminated))
 
 
 def way(player: str, found: dict[str, Result]) -> float | None:
@@ -183,6 +207,8 @@ def main() -> None:
         measured(f"arch {band}", replace(base, arch=arch), "arch", args.players)
     if "wall" in args.tasks:
         measured("wall default", base, "wall", args.players)
+        published["wall_released"] = share = released(base, args.episodes, args.seed)
+        print(f"wall: oracle stands with free hands {RELEASE_S:g} s after the push: {share:.0%}")
     fair = []
     for speed in args.pushes:
         wall = replace(base.wall, push_speed_range=(speed, speed), away_probability=0.0)

@@ -25,6 +25,8 @@ import torch
 from report import parser, publish
 from tick_logging import logging_figures, percentiles
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
+
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy, PolicyStep
 from egovcp.rate import FixedRate, LockstepClock, MonotonicClock
@@ -32,7 +34,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.spec import ACTION_DIM, CONTROLLER_HZ, PLANNER_HZ, STATE_DIM, STATE_SLICES
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.control import ControlLoop
-from egovcp_deploy.live.control_process import CONTROL, RECEIVING, raise_priority, raised_priority
+from egovcp_deploy.live.control_process import CONTROL, RECEIVING, raise_priority
 from egovcp_deploy.live.hardware import Hardware, open_hardware
 from egovcp_deploy.live.processes import simulated_robot
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
@@ -41,6 +43,7 @@ from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
+from tests.support.robots.fake_g1 import raised_priority
 
 _CONTROLLER = "stance"
 _SETTLE_TICKS = 10  # after a switch between the two cases
@@ -111,8 +114,9 @@ def control_figures(rounds: int) -> dict[str, object]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         with raised_priority(RECEIVING):  # for the simulated robot, too
-            options = stack.enter_context(simulated_robot(config, folder / "outcomes.json"))
-            hardware = open_hardware(options)
+            hardware = open_hardware(
+                *stack.enter_context(simulated_robot(config, folder / "outcomes.json"))
+            )
         granted = raise_priority(CONTROL)
         try:
             clock = MonotonicClock()

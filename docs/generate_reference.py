@@ -22,6 +22,7 @@ MODULES = (
     "egovcp.model",
     "egovcp.plan",
     "egovcp.sim",
+    "egovcp.sim.tasks",
     "egovcp.robot",
     "egovcp.log",
     "egovcp.checks",
@@ -39,13 +40,12 @@ def commands() -> dict[str, str]:
 
 
 def help_of(entry_point: str) -> str:
-    """The complete help of a command, or the plain one of a command with subcommands."""
+    """The complete help of a command."""
     module, function = entry_point.split(":")
     command = getattr(import_module(module), function)
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
-        if command(["--help=all"]) != 0:
-            command(["--help"])
+        command(["--help=all"])
     return output.getvalue()
 
 

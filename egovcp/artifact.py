@@ -56,23 +56,13 @@ from egovcp.plan.config import require_affordable
 if TYPE_CHECKING:
     from egovcp.data import ReturnConfig
 
-#: Options of world models of older versions.
-_TRACKER_OPTIONS: Final = frozenset(
-    {
-        "flight",
-        "motion_ahead",
-        "paint_flight",
-        "q_heads",
-        "value_of_passing",
-        "value_state",
-        "value_units",
-    }
-)
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 #: All files of an artifact.
 FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
 #: Where a training run keeps its latest policy.
 _IN_RUN: Final = "checkpoints/last/pretrained_model"
+#: Folder of the policies that ship with the package, one folder each.
+PRETRAINED: Final = Path(__file__).with_name("pretrained")
 _RETRY_POLICY = RetryPolicy()
 
 
@@ -189,12 +179,13 @@ def _replace(path: Path, new: Path) -> None:
 
 
 def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artifact:
-    """Load and validate a policy from a folder or, failing that, a Hub model id.
+    """Load and validate a policy: one that ships with egovcp, a folder, or a Hub model id.
 
     If the Hub cannot be reached, an earlier download of that revision is used.
 
     Args:
-        path: the folder, or `user/name`.
+        path: name of a shipped policy (`contact`), folder, or `user/name`, the first that exists.
+            A folder of the name of a shipped policy is written with a slash: `./contact`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
             `Artifact.path` is the commit's SHA then.
         retry: retries of requests to the Hub.
@@ -202,7 +193,7 @@ def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POL
     Raises:
         ArtifactError: missing, tampered with, made for another feature spec, or with weights or
             options that cannot be used.
-        UsageError: a revision is given for a folder.
+        UsageError: a revision is given for a folder or a shipped policy.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     folder = _locate(path, revision, retry)
@@ -225,16 +216,10 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
         ArtifactError: missing, damaged, or too expensive for this machine.
     """
     config = read_object(folder / CONFIG)
-    world_model = config.get("world_model")
-    if isinstance(world_model, dict) and not _TRACKER_OPTIONS.isdisjoint(world_model):
-        raise ArtifactError(
-            f"{folder / CONFIG}: trained by an older version with a ball tracker, which this "
-            "version no longer has; train again"
-        )
     try:
         if config.get("type") != "egovcp":
             raise DecodeError(f'type is {shown(config.get("type"))}, expected "egovcp"')
-        model = decode(WorldModelConfig, world_model, "world_model")
+        model = decode(WorldModelConfig, config.get("world_model"), "world_model")
         planner = decode(PlannerConfig, config.get("planner"), "planner")
         require_compatible(model, planner)
     except (DecodeError, UsageError) as error:
@@ -262,12 +247,25 @@ def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> Wor
         return load_model(config, shapes, content)
 
 
+def shipped_policies() -> list[str]:
+    """Names of the policies that ship with this package."""
+    return sorted(manifest.parent.name for manifest in PRETRAINED.glob(f"*/{MANIFEST}"))
+
+
+def policy_folder(path: str) -> Path:
+    """Folder that ``path`` names unless it is a Hub id: a shipped policy, else a folder."""
+    if path in shipped_policies():
+        return PRETRAINED / path
+    return Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
+
+
 def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
-    folder = Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
+    folder = policy_folder(path)
     is_folder = os.path.isdir(folder)
     if is_folder and revision:
+        kind = "a folder" if folder.parent != PRETRAINED else "a policy that ships with egovcp"
         raise UsageError(
-            f"{path} is a folder, and revision {revision} pins a policy of the Hub; drop the one "
+            f"{path} is {kind}, and revision {revision} pins a policy of the Hub; drop the one "
             "or the other"
         )
     if is_folder:
@@ -277,7 +275,8 @@ def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
         found = "not a folder" if os.path.lexists(folder) else "no such folder"
         raise ArtifactError(
             f"{found}: {path!r}; expected a policy folder with {CONFIG}, {WEIGHTS} and "
-            f"{MANIFEST} (a run's {_IN_RUN}) or a Hub id 'user/name'"
+            f"{MANIFEST} (a run's {_IN_RUN}), a Hub id 'user/name'"
+            + "".join(f", or {name!r}, which ships with egovcp" for name in shipped_policies())
         )
     try:
         return snapshot(path, revision, retry, "model", patterns=FILES)

@@ -70,19 +70,10 @@ class Bounds:
 _ANY: Final = Bounds()
 
 
-def bounded[T](
-    default: T,
-    *,
-    least: float | None = None,
-    most: float | None = None,
-    above: float | None = None,
-    below: float | None = None,
-    longest: int | None = None,
-    per_core: int | None = None,
-) -> T:
+def bounded[T](default: T, **limits: Any) -> T:
     """A dataclass field whose value, or each number in it if it is a collection, must lie within
-    the bounds. None is always valid."""
-    metadata = {_KEY: Bounds(least, most, above, below, longest, per_core)}
+    `Bounds(**limits)`. None is always valid."""
+    metadata = {_KEY: Bounds(**limits)}
     if isinstance(default, dict):
         return field(default_factory=partial(copy, default), metadata=metadata)
     return field(default=default, metadata=metadata)

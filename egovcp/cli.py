@@ -26,11 +26,13 @@ from egovcp.entry_point import INTERRUPTED, raise_on_sigint
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.files import write_text
 from egovcp.flags import HELP, flag_values, merged, split_flags
-from egovcp.help_text import print_help
+from egovcp.help_text import help_text
 from egovcp.outputs import check_output_files
-from egovcp.packages import missing_package
 from egovcp.terminal import echo, one_line
 from egovcp.values import WrongValue, build
+
+type Defaults = Callable[[Sequence[str]], Mapping[str, Any]]
+"""Flags, each as ``--name=value`` -> nested default values."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,12 @@ def parse_config[C](
     argv: Sequence[str],
     prog: str,
     epilog: str = "",
-    defaults: Callable[[Sequence[str]], Mapping[str, Any]] | None = None,
+    defaults: Defaults | None = None,
 ) -> C:
     """Parse dotted flags into ``config_class``.
 
     A flag without a value is true (``--resume`` is ``--resume=true``). A list is written
-    ``[a, b]`` or ``(a, b)``. ``defaults`` maps the flags, each as ``--name=value``, to nested
-    default values; flags and the config file override them.
+    ``[a, b]`` or ``(a, b)``. Flags and the config file override ``defaults``.
 
     Raises:
         EgovcpError: a value is invalid; the message names the flag.
@@ -84,7 +85,8 @@ def parse_config[C](
         args = split_flags(argv, config_class)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
         if topics:
-            print_help(config_class, prog, epilog, topics[-1])
+            echo(help_text(config_class, prog, epilog, topics[-1]))
+            raise SystemExit(0)
         beneath = defaults(args) if defaults else {}
         config = build(config_class, merged(beneath, flag_values(args, config_class)), "--")
     except WrongValue as error:
@@ -102,9 +104,12 @@ def run_command[C](
     *,
     prog: str,
     epilog: str = "",
-    defaults: Callable[[Sequence[str]], Mapping[str, Any]] | None = None,
+    defaults: Defaults | None = None,
 ) -> int:
-    """Parse ``argv``, call ``run`` and return the exit code; errors are printed as one line."""
+    """Parse ``argv``, call ``run`` and return the exit code; errors are printed as one line.
+
+    `EntryPoint` handles missing packages and closed pipes.
+    """
     args = list(sys.argv[1:] if argv is None else argv)
     switch = ("--debug", "--debug=true")
     debug = any(a in switch for a in args)
@@ -118,19 +123,37 @@ def run_command[C](
         return INTERRUPTED
     except EgovcpError as error:
         return report_error(prog, error, debug)
-    except ModuleNotFoundError as error:
-        missing = missing_package(error, config_class.__module__, prog)
-        if missing is None:
-            raise
-        return report_error(prog, missing, debug)
     except BrokenPipeError:
-        raise  # handled by `EntryPoint`
+        raise
     except (OSError, UnicodeEncodeError) as error:
         failure = _user_error(error)
         if failure is None:
             raise
         return report_error(prog, failure, debug)
     return 0
+
+
+def given_options(argv: Sequence[str]) -> dict[str, str]:
+    """Name -> value of the flags ``--name=value``."""
+    return dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+
+
+def preset_defaults(
+    presets: Mapping[str, Callable[[], object]], argv: Sequence[str]
+) -> dict[str, Any]:
+    """The options of the preset that ``--preset`` names; empty without a known one.
+
+    Raises:
+        UsageError: a config file, which has all options, would hide the preset.
+    """
+    given = given_options(argv)
+    if "preset" in given and "config_path" in given:
+        raise UsageError(
+            f"--preset={given['preset']} and --config_path={given['config_path']} both set "
+            "all options; give one of them, and single options as flags"
+        )
+    name = given.get("preset", "")
+    return dict(draccus.encode(presets[name]())) if name in presets else {}
 
 
 _MESSAGE_LIMIT: Final = 2000

@@ -37,12 +37,7 @@ class EntryPoint:
     """A command whose module is imported when it is called."""
 
     def __init__(self, prog: str, module: str) -> None:
-        """Describe a command.
-
-        Args:
-            prog: its name.
-            module: the module with its function ``main(argv) -> int``.
-        """
+        """The command ``prog``, which is ``module.main(argv) -> int``."""
         self.prog, self.module = prog, module
 
     def __call__(self, argv: Sequence[str] | None = None) -> int:
@@ -74,18 +69,40 @@ class EntryPoint:
     def _run(self, argv: Sequence[str] | None) -> int:
         from importlib import import_module
 
+        from egovcp.errors import EgovcpError
+        from egovcp.terminal import echo, one_line
+
         if "--version" in (sys.argv[1:] if argv is None else argv):
             return self._print_version()
         try:
+            argv = self._with_task(sys.argv[1:] if argv is None else argv)
             main: Callable[[Sequence[str] | None], int] = import_module(self.module).main
             code = main(argv)
         except ModuleNotFoundError as error:
             return self._missing(error)
+        except EgovcpError as error:  # of --task=module:Class
+            echo(f"{self.prog}: error: {one_line(error)}", error=True)
+            return error.exit_code
         except SystemExit as end:  # argparse, after --help
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         return code
+
+    def _with_task(self, argv: Sequence[str]) -> list[str]:
+        """The arguments with the name of the task for ``--task=package.module:Class``.
+
+        The task is registered before the command is imported, so that it has the task's options.
+        """
+        args = list(argv)
+        for i, arg in enumerate(args):
+            value = arg.removeprefix("--task=")
+            is_task = value != arg or (i and args[i - 1] == "--task")
+            if ":" in value and (is_task or (i == 1 and self.prog == "egovcp-task")):
+                from egovcp.sim.tasks.registry import register_task
+
+                args[i] = arg.removesuffix(value) + register_task(value)
+        return args
 
     def _print_version(self) -> int:
         from importlib import metadata

@@ -3,6 +3,7 @@
 Reading: a downloaded dataset or policy may hold a FIFO that never ends, a link to a device,
 gigabytes of JSON, or deeply nested JSON that overflows the parser. These are refused with
 `UnsafeFileError`. Its message has no path: callers turn it into an error that names the file.
+Functions with a path raise OSError if the file is missing or cannot be read.
 
 Writing: a file or folder is complete or absent, also after a crash.
 """
@@ -18,8 +19,9 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any, Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
 
@@ -35,7 +37,6 @@ _KINDS: Final[Mapping[int, str]] = {
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
 }
-_CHUNK_BYTES: Final = 1 << 20
 _STRING: Final = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
 _DEPTH_CHANGE: Final = np.zeros(256, dtype=np.int8)  # by character
 _DEPTH_CHANGE[list(b"[{")] = 1
@@ -50,27 +51,14 @@ def require_regular(path: Path, limit_bytes: int | None = None) -> os.stat_resul
     """Raise unless ``path`` is a regular file of bounded size; links are followed.
 
     The file is not opened; for libraries that open it themselves.
-
-    Args:
-        path: the file.
-        limit_bytes: largest size; None: any.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, or larger.
-        OSError: it is missing, or its folder cannot be read.
     """
     found = path.stat()
     _check(found, limit_bytes)
     return found
 
 
-def open_regular(path: Path, limit_bytes: int | None = None) -> IO[bytes]:
-    """Open a regular file of bounded size for reading; never blocks on a FIFO or a device.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, or larger than ``limit_bytes``.
-        OSError: it is missing, or cannot be read.
-    """
+def open_regular(path: Path, limit_bytes: int | None = None) -> BufferedReader:
+    """Open a regular file of bounded size for reading; never blocks on a FIFO or a device."""
     require_regular(path, limit_bytes)  # before opening: opening a device can have effects
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC), "rb")
     try:
@@ -82,12 +70,7 @@ def open_regular(path: Path, limit_bytes: int | None = None) -> IO[bytes]:
 
 
 def read_bytes(path: Path, limit_bytes: int) -> bytes:
-    """The content of a regular file of at most ``limit_bytes``.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, or larger.
-        OSError: it is missing, or cannot be read.
-    """
+    """The content of a regular file of at most ``limit_bytes``."""
     with open_regular(path, limit_bytes) as file:
         content = file.read(limit_bytes + 1)  # files of /proc have size 0
     if len(content) > limit_bytes:
@@ -96,12 +79,7 @@ def read_bytes(path: Path, limit_bytes: int) -> bytes:
 
 
 def read_text(path: Path, limit_bytes: int) -> str:
-    """The content of a UTF-8 text file; see `read_bytes`.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, larger, or not UTF-8.
-        OSError: it is missing, or cannot be read.
-    """
+    """The content of a UTF-8 text file; see `read_bytes`."""
     try:
         return read_bytes(path, limit_bytes).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -114,33 +92,21 @@ def read_json(
     limit_depth: int = JSON_LIMIT_DEPTH,
     allow_nan: bool = False,
 ) -> Any:
-    """The content of a JSON file.
-
-    Args:
-        path: a regular file.
-        limit_bytes: largest size.
-        limit_depth: deepest nesting of lists and objects.
-        allow_nan: whether a number may be NaN or infinite.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, larger, not UTF-8, not JSON, nested more deeply,
-            or holds a number that is not finite or a string that is not valid Unicode.
-        OSError: it is missing, or cannot be read.
-    """
+    """The content of a JSON file; see `read_text` and `parse_json`."""
     return parse_json(read_text(path, limit_bytes), limit_depth, allow_nan)
 
 
 def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool = False) -> Any:
-    """The value of an untrusted JSON text; see `read_json`.
+    """The value of an untrusted JSON text.
 
     Raises:
-        UnsafeFileError: it is not JSON, nested more deeply than ``limit_depth``, or holds a number
-            that is not finite or a string that is not valid Unicode.
+        UnsafeFileError: it is not JSON, nested more deeply than ``limit_depth``, or holds a string
+            that is not valid Unicode, or, without ``allow_nan``, a number that is not finite.
     """
     hooks: dict[str, Any] = (
         {} if allow_nan else {"parse_float": _finite, "parse_constant": _refuse_constant}
     )
-    _check_depth(text, limit_depth)
+    check_depth(text, limit_depth)
     try:
         content = json.loads(text, **hooks)
     except UnsafeFileError:
@@ -157,51 +123,10 @@ def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool =
     return content
 
 
-def require_bounded(
-    value: object, limit_depth: int = JSON_LIMIT_DEPTH, limit_items: int = 100_000
-) -> None:
-    """Raise unless a parsed value has a bounded depth and a bounded number of items.
-
-    With YAML aliases 1 kB of text can describe 10^9 items.
-
-    Raises:
-        UnsafeFileError: it has more.
-    """
-    sizes: dict[int, int] = {}  # by id: each value is visited once but counted each time
-
-    def size(item: object, depth: int) -> int:
-        if depth > limit_depth:
-            raise UnsafeFileError(_too_deep(limit_depth))
-        if id(item) not in sizes:
-            match item:
-                case Mapping():
-                    inner = list(item.values())
-                case list() | tuple():
-                    inner = list(item)
-                case _:
-                    return 1
-            sizes[id(item)] = 1 + sum(size(part, depth + 1) for part in inner)
-        return sizes[id(item)]
-
-    if size(value, 0) > limit_items:
-        raise UnsafeFileError(f"more than {limit_items} values, counting each time one is repeated")
-
-
 def sha256(path: Path, limit_bytes: int | None = None) -> str:
-    """Hexadecimal SHA-256 of a regular file.
-
-    Raises:
-        UnsafeFileError: it is not a regular file, or larger than ``limit_bytes``.
-        OSError: it is missing, or cannot be read.
-    """
-    digest, total = hashlib.sha256(), 0
+    """Hexadecimal SHA-256 of a regular file."""
     with open_regular(path, limit_bytes) as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-            total += len(chunk)
-            if limit_bytes is not None and total > limit_bytes:
-                raise UnsafeFileError(_too_large("more", limit_bytes))
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _check(found: os.stat_result, limit_bytes: int | None) -> None:
@@ -220,8 +145,8 @@ def _too_deep(limit: int) -> str:
     return f"nested more than {limit} levels deep"
 
 
-def _check_depth(text: str, limit: int) -> None:
-    """Count the brackets outside strings, which is faster than walking the parsed value."""
+def check_depth(text: str, limit: int = JSON_LIMIT_DEPTH) -> None:
+    """Raise `UnsafeFileError` if brackets outside strings are nested more deeply than ``limit``."""
     bare = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
     if len(bare) and _DEPTH_CHANGE[bare].cumsum(dtype=np.int32).max() > limit:
         raise UnsafeFileError(_too_deep(limit))

@@ -16,12 +16,8 @@ from typing import Any, Final
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
-from egovcp.files import UnsafeFileError, read_text, require_bounded
-from egovcp.removed_options import (
-    refuse_preset_flag,
-    refuse_removed_flag,
-    refuse_removed_options,
-)
+from egovcp.files import UnsafeFileError, read_text
+from egovcp.removed_options import refuse_preset_flag, refuse_removed_flag
 from egovcp.values import (
     WrongValue,
     collection_or_text,
@@ -36,14 +32,15 @@ CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
 #: Replaces the type of a flag: an option that only a configuration file or Python can set.
 NOT_A_FLAG: Final = object()
-#: LeRobot's name of an option -> its name here, where both mean the same.
-LEROBOT_NAMES: Final[Mapping[str, str]] = {
+#: Other names of options, most of them LeRobot's.
+OTHER_NAMES: Final[Mapping[str, str]] = {
     "env.task": "task",
     "eval.n_episodes": "episodes",
     "eval.batch_size": "num_envs",
     "policy.device": "device",
     "eval_steps": "eval_freq",
     "env_eval_freq": "eval_freq",
+    "reward.weights": "returns.weights",
 }
 _FILE_LIMIT_BYTES: Final = 64 << 10  # YAML is parsed at about 50 kB/s
 
@@ -93,7 +90,7 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
     flag, equals, value = arg.partition("=")
     if flag in HELP:
         return arg
-    own = f"--{LEROBOT_NAMES.get(flag.removeprefix('--'))}"
+    own = f"--{OTHER_NAMES.get(flag.removeprefix('--'))}"
     if flag not in flags and own in flags:
         flag, arg = own, f"{own}{equals}{value}"
     if not flag.startswith("-"):
@@ -112,12 +109,10 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
 def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
     """The values of all flags and of the config file, nested by group; the last flag decides.
 
-    Args:
-        args: as `split_flags` returns them.
-        config_class: the dataclass of the options.
+    ``args`` are those that `split_flags` returns.
 
     Raises:
-        UsageError: a value has the wrong type, or the file cannot be read or has removed options.
+        UsageError: a value has the wrong type, or the file cannot be read.
     """
     flags = options_of(config_class)
     given: dict[str, Any] = {}
@@ -170,15 +165,13 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 def _config_file(file: str) -> dict[str, Any]:
     try:
-        options = read_config(Path(file))
+        return read_config(Path(file))
     except OSError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
     except UnsafeFileError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error}") from error
     except ValueError as error:
         raise UsageError(f"{CONFIG_FILE}: {file} {error}") from error
-    refuse_removed_options(options, f"{CONFIG_FILE}={file}")
-    return options
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -192,7 +185,6 @@ def read_config(path: Path) -> dict[str, Any]:
     text = read_text(path, _FILE_LIMIT_BYTES)
     try:
         found: Any = tomllib.loads(text) if path.suffix == ".toml" else parse_collection(text)
-        require_bounded(found)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"holds no options: {error}") from error
     if not isinstance(found or {}, dict):

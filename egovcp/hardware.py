@@ -22,12 +22,8 @@ def available_cores() -> int:
 
 
 def require_memory(option: str, needed: int) -> None:
-    """Raise `UsageError`, which names the option, unless ``needed`` bytes of memory are free.
-
-    Args:
-        option: as on the command line, ``--num_envs=8``.
-        needed: a lower bound.
-    """
+    """Raise `UsageError`, which names an option such as ``--num_envs=8``, unless ``needed`` bytes
+    of memory are free."""
     free = available_bytes()
     if needed > free:
         raise UsageError(

@@ -1,7 +1,8 @@
 """``--help`` of a command: its options in groups, with types, bounds and defaults.
 
 ``--help`` shows the options outside groups and those of small groups, each with its first sentence,
-and lists the other groups. ``--help=GROUP`` shows one group in full, ``--help=all`` every option.
+and lists the other groups. ``--help=GROUP`` shows one group in full, ``--help=all`` every option,
+and ``--help=flags`` one line per flag with the values to choose from, for shell completion.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 from egovcp.bounds import as_flag_value, bounds_of
 from egovcp.errors import UsageError, did_you_mean
 from egovcp.flags import CONFIG_FILE, flags_of
-from egovcp.terminal import echo
-from egovcp.values import default_of, is_dataclass_type, option_types, type_name
+from egovcp.values import choices, default_of, is_dataclass_type, option_types, type_name
 
 ALL: Final = "all"
+FLAGS: Final = "flags"
 _WIDTH: Final = 110
 _COLUMN: Final = 40  # where descriptions start
 _SMALL_GROUP: Final = 4
@@ -63,17 +64,19 @@ class _Group:
         return not self.name or ("." not in self.name and len(self.options) <= _SMALL_GROUP)
 
 
-def print_help(config_class: type, prog: str, epilog: str, topic: str = "") -> NoReturn:
-    """Print the help and end the process.
+def help_text(config_class: type, prog: str = "", epilog: str = "", topic: str = "") -> str:
+    """The help of a command.
 
     Args:
-        topic: a group such as ``policy.loss``, `ALL`, or empty for the overview.
+        topic: a group such as ``policy.loss``, `ALL`, `FLAGS`, or empty for the overview.
 
     Raises:
-        SystemExit: always, except for an unknown topic.
         UsageError: there is no such group.
     """
     flags = flags_of(config_class)
+    if topic == FLAGS:
+        kinds = {flag: kind for flag, kind in flags.items() if not is_dataclass_type(kind)}
+        return "\n".join(" ".join([flag, *choices(kind)]) for flag, kind in kinds.items())
     groups = [
         dataclasses.replace(group, options=tuple(o for o in group.options if o.flag in flags))
         for group in _groups(config_class, None, "")
@@ -81,15 +84,12 @@ def print_help(config_class: type, prog: str, epilog: str, topic: str = "") -> N
     ]
     if not topic:
         lines = [f"{prog}: {_first_paragraph(config_class)}", *_overview(groups), ""]
-        lines += textwrap.wrap(f"{_SYNTAX} {epilog}".strip(), _WIDTH)
-    else:
-        names = {group.name.partition(".")[0] for group in groups} | {g.name for g in groups}
-        if topic != ALL and topic not in names - {""}:
-            raise UsageError(f"--help={topic}: no such group{did_you_mean(topic, names - {''})}")
-        shown = [g for g in groups if topic == ALL or f"{g.name}.".startswith(f"{topic}.")]
-        lines = [line for group in shown for line in _section(group, full=True)][1:]
-    echo("\n".join(lines))
-    raise SystemExit(0)
+        return "\n".join(lines + textwrap.wrap(f"{_SYNTAX} {epilog}".strip(), _WIDTH))
+    names = {group.name.partition(".")[0] for group in groups} | {g.name for g in groups}
+    if topic != ALL and topic not in names - {""}:
+        raise UsageError(f"--help={topic}: no such group{did_you_mean(topic, names - {''})}")
+    shown = [g for g in groups if topic == ALL or f"{g.name}.".startswith(f"{topic}.")]
+    return "\n".join([line for group in shown for line in _section(group, full=True)][1:])
 
 
 def _overview(groups: Sequence[_Group]) -> Iterator[str]:

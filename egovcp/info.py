@@ -9,11 +9,12 @@ from importlib import metadata
 from typing import Any
 
 from egovcp.cli import run_command
+from egovcp.completion import Shell, completion_script
 from egovcp.errors import EnvironmentFailure
 from egovcp.hardware import available_bytes, hardware
 from egovcp.outputs import output_file, write_report
 from egovcp.plan.backends import library
-from egovcp.terminal import echo_lines
+from egovcp.terminal import echo, echo_lines
 
 _PACKAGES = (
     *("egovcp", "egovcp-collect", "egovcp-train", "egovcp-deploy", "egovcp-experiment"),
@@ -27,10 +28,15 @@ class MachineInfoConfig:
 
     json: str = output_file()
     """Also write everything to this JSON file."""
+    completion: Shell | None = None
+    """Instead, print the completion script of all commands for this shell."""
 
 
 def show(config: MachineInfoConfig) -> None:
-    """Print the report, and write it if a file is given."""
+    """Print the report, and write it if a file is given; or print a completion script."""
+    if config.completion:
+        echo(completion_script(config.completion))
+        return
     report = machine_report()
     write_report(config.json, report)
     flat = report | {f"planner backend {k}": v for k, v in report["planner_backends"].items()}

@@ -23,6 +23,8 @@ from egovcp.files import UnsafeFileError, read_json, write_json
 SCHEMA_VERSION: Final = 2
 MANIFEST: Final = "manifest.json"
 SEAL: Final = "manifest_sha256"
+FORMAT_KEYS: Final = ("schema_version", "egovcp_version", "features", "files", SEAL)
+"""Entries that are made when an artifact is written; all others are its provenance."""
 
 #: Type of each entry that is read; all but the first two are optional.
 _TYPES: Final[Mapping[str, Any]] = {

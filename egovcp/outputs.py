@@ -28,11 +28,7 @@ _KEY: Final = "output_file"
 
 
 def output_file(*, or_stdout: bool = False) -> str:
-    """A dataclass field for a file to write; default: empty, no file.
-
-    Args:
-        or_stdout: whether `STDOUT` is allowed.
-    """
+    """A dataclass field for a file to write, or `STDOUT` if allowed; default: empty, no file."""
     exceptions = ("", STDOUT) if or_stdout else ("",)
     option: str = field(default="", metadata={_KEY: exceptions})
     return option

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from importlib.util import find_spec
@@ -22,6 +23,7 @@ from egovcp.errors import EnvironmentFailure
 DISTRIBUTIONS: Final = MappingProxyType(
     {
         "mcap_ros2": "mcap-ros2-support",
+        "mpl_toolkits": "matplotlib",
         "PIL": "pillow",
         "rerun": "rerun-sdk",
         "rsl_rl": "rsl-rl-lib",
@@ -76,9 +78,7 @@ def missing_package(
 ) -> MissingPackage | None:
     """The error for a failed import; None if the module is our own or the standard library's.
 
-    Args:
-        distribution: see `require_packages`, or the name of the imported module.
-        purpose: see `require_packages`.
+    For the arguments see `require_packages`; ``distribution`` may be one of its modules.
     """
     top = (error.name or "").partition(".")[0]
     own = distribution_of(top) in _OWN or top.startswith("egovcp_")
@@ -88,18 +88,20 @@ def missing_package(
 
 
 def install_command(distribution: str, *packages: str) -> str:
-    """The command that installs packages as an extra of a distribution.
+    """The command that installs packages, by the extra with the most of them if there is one.
 
-    Prefers extras of the distribution itself to those of its dependencies, and small extras. A
-    package in no extra is installed by its name.
+    Prefers extras of the distribution itself to those of its dependencies, and small extras.
     """
+    distribution = canonicalize_name(distribution)
     wanted = {canonicalize_name(package) for package in packages}
-    targets: list[str] = []
-    while wanted:
-        found, names = _best(canonicalize_name(distribution), frozenset(wanted))
-        targets.append(f"'{found}'" if "[" in found else found)
-        wanted -= names
-    return f"pip install {' '.join(targets)}"
+
+    def preference(option: tuple[str, frozenset[str]]) -> tuple[int, bool, int]:
+        name, contents = option
+        return len(wanted & contents), name.partition("[")[0] == distribution, -len(contents)
+
+    best, contents = max(_installable(distribution), key=preference)
+    targets = [f"'{best}'" if "[" in best else best] if wanted & contents else []
+    return " ".join(["pip install", *targets, *sorted(wanted - contents)])
 
 
 def _message(distribution: str, purpose: str, modules: list[str]) -> str:
@@ -109,25 +111,6 @@ def _message(distribution: str, purpose: str, modules: list[str]) -> str:
         f"{purpose} needs {' and '.join(packages)}, {verb} not installed; install it: "
         f"{install_command(distribution, *packages)}"
     )
-
-
-def _best(distribution: str, wanted: frozenset[str]) -> tuple[str, frozenset[str]]:
-    """(what to install, the wanted packages that it contains)."""
-    options = [
-        (name, wanted & brought, len(brought)) for name, brought in _installable(distribution)
-    ]
-    options = [option for option in options if option[1]]
-    if not options:
-        package = min(wanted)
-        return package, frozenset({package})
-    most = max(len(names) for _, names, _ in options)
-
-    def preference(option: tuple[str, frozenset[str], int]) -> tuple[bool, int]:
-        name, _, size = option
-        return name.partition("[")[0] != distribution, size
-
-    name, names, _ = min((o for o in options if len(o[1]) == most), key=preference)
-    return name, names
 
 
 def _installable(distribution: str) -> Iterator[tuple[str, frozenset[str]]]:
@@ -156,20 +139,16 @@ def _closure(distribution: str, extra: str) -> frozenset[str]:
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
     """Requirements on this platform with an extra; empty: without extras."""
-    try:
-        declared = metadata.requires(distribution) or []
-    except metadata.PackageNotFoundError:
-        return []
-    requirements = [Requirement(text) for text in declared]
-    return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": extra})]
+    with suppress(metadata.PackageNotFoundError):
+        found = [Requirement(text) for text in metadata.requires(distribution) or []]
+        return [r for r in found if r.marker is None or r.marker.evaluate({"extra": extra})]
+    return []
 
 
 def _extras(distribution: str) -> list[str]:
-    try:
-        found = metadata.metadata(distribution).get_all("Provides-Extra")
-    except metadata.PackageNotFoundError:
-        return []
-    return sorted(found or [])
+    with suppress(metadata.PackageNotFoundError):
+        return sorted(metadata.metadata(distribution).get_all("Provides-Extra") or [])
+    return []
 
 
 def _is_own(distribution: str) -> bool:

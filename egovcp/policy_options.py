@@ -24,15 +24,16 @@ class PolicyOptions:
     """Which policy artifact."""
 
     path: str = ""
-    """Folder of the artifact, or its Hub id `user/name`."""
+    """Folder of the artifact, its Hub id `user/name`, or `contact`, which ships with egovcp (a
+    folder of that name: `./contact`)."""
     revision: str = ""
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
-    def require(self, otherwise: str = "") -> None:
-        """Raise `UsageError` unless a path is given; ``otherwise`` is an alternative to name."""
+    def require(self, alternative: str = "") -> None:
+        """Raise `UsageError` unless a path is given; the message also names ``alternative``."""
         if not self.path:
-            offer = f", or {otherwise}" if otherwise else ""
-            raise UsageError(f"--policy.path is missing; name the artifact{offer}")
+            suffix = f", or {alternative}" if alternative else ""
+            raise UsageError(f"--policy.path is missing; name the artifact{suffix}")
 
 
 @dataclass(frozen=True)
@@ -42,25 +43,26 @@ class PlannerOptions:
     samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""
     horizon: int | None = bounded(None, least=1, most=1000)
-    """N, planner ticks of 40 ms."""
+    """N, planning horizon, steps of 40 ms."""
     objective: Objective | None = None
     """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward."""
     iterations: int | None = bounded(None, least=1, most=10_000)
-    """Rounds of the search."""
+    """Iterations of the search."""
     elites: int | None = bounded(None, least=1, most=2**20)
-    """Best candidates that the next round is fitted to."""
+    """Best candidates that the next iteration is fitted to."""
     min_std: float | None = bounded(None, least=0)
-    """Smallest standard deviation of candidates, in steps of the action parameterization."""
-    hands_cost: float | None = bounded(None, least=0)
-    """Cost of hands away from the neutral pose: this return times their mean squared action."""
-    step_cost: float | None = bounded(None, least=0)
-    """Cost of motion: this return times the mean squared step of the plan."""
+    """Smallest sampling standard deviation, in units of eta."""
+    action_rate_cost: float | None = bounded(None, least=0)
+    """Cost of action changes per step, times their mean square, where 1 is the largest change."""
+    pose_cost: float | None = bounded(None, least=0)
+    """Cost of the pose per step, times the mean squared action."""
     action_parameterization: ActionParameterization | None = None
-    """Candidates: random_walk (a step in every tick), or target (a ramp to a pose that is held)."""
+    """How a sample becomes actions: target (move towards one target, then hold it), or random_walk
+    (an independent change at every step)."""
     termination_rule: TerminationRule | None = None
-    """Values after a predicted failure: paper (0), shift (lowest return of the data), survival
-    (weighted with the survival probability)."""
+    """Value of a failed candidate: paper (0), shift (lowest return of the data), or survival
+    (weighted by the probability of survival)."""
     latent: Latent | None = None
     """z of imagined states: mean or sample of the prior."""
     optimiser: OptimiserName | None = None
@@ -80,8 +82,12 @@ class PlannerOptions:
             raise error.with_prefix("--planner.") from error
 
 
-def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:
+def load_policy(policy: PolicyOptions | str, planner: PlannerOptions | None = None) -> Artifact:
     """The artifact with the planner options applied.
+
+    Args:
+        policy: the options, or only the path: `load_policy("contact")`.
+        planner: changes to the artifact's planner.
 
     Raises:
         ArtifactError: missing, changed, or made for another feature spec.
@@ -89,7 +95,11 @@ def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:
         UsageError: contradicting numbers, a plan that takes too much time or memory, or a head that
             the model does not have.
     """
+    if isinstance(policy, str):
+        policy = PolicyOptions(policy)
     artifact = load_artifact(policy.path, policy.revision)
+    if planner is None:
+        return artifact
     changed = planner.apply(artifact.planner)
     require_compatible(artifact.world_model.config, changed)
     require_affordable(artifact.world_model.config, changed)

@@ -31,14 +31,12 @@ from egovcp.errors import ArtifactError
 from egovcp.files import write_bytes
 from egovcp.model.depth import nearness
 from egovcp.plan import PolicyStep
-from egovcp.tensor_file import TensorFile, read_tensor_file
+from egovcp.tensor_file import read_tensor_file
 
 SCHEMA: Final = "egovcp-reactive-1"
 KERNELS: Final = (8, 3, 3)
 STRIDES: Final = (4, 2, 2)
 _LIMIT_BYTES: Final = 64 << 20
-
-type Layer = tuple[Tensor, Tensor]  # weight, bias
 
 
 @dataclass(frozen=True)
@@ -91,10 +89,8 @@ class FrameStack:
 class ReactiveNetwork:
     """The actor: a CNN of the images, and an MLP of its output and the standardised state (ELU)."""
 
-    mean: Tensor  # (74,)
-    std: Tensor  # (74,)
-    cnn: tuple[Layer, ...]
-    mlp: tuple[Layer, ...]
+    tensors: Mapping[str, Tensor]
+    """By the names of `tensor_shapes`."""
     config: ReactiveConfig
     controller_id: str
     """Low-level controller of the training."""
@@ -105,12 +101,18 @@ class ReactiveNetwork:
     def __call__(self, pictures: Tensor, state: Tensor) -> Tensor:
         """Pictures (E, frames, 48, 64) and state (E, 74) -> actions (E, 7) in [-1, 1]."""
         x = pictures
-        for (weight, bias), stride in zip(self.cnn, STRIDES, strict=True):
-            x = F.elu(F.conv2d(x, weight, bias, stride))
-        x = torch.cat([(state - self.mean) / self.std, x.flatten(1)], -1)
-        for weight, bias in self.mlp[:-1]:
-            x = F.elu(F.linear(x, weight, bias))
-        return F.linear(x, *self.mlp[-1]).clamp(-1.0, 1.0)
+        for i, stride in enumerate(STRIDES):
+            x = F.elu(F.conv2d(x, *self._layer("cnn", i), stride))
+        standardised = (state - self.tensors["mean"]) / self.tensors["std"]
+        x = torch.cat([standardised, x.flatten(1)], -1)
+        depth = len(self.config.hidden)
+        for i in range(depth):
+            x = F.elu(F.linear(x, *self._layer("mlp", i)))
+        return F.linear(x, *self._layer("mlp", depth)).clamp(-1.0, 1.0)
+
+    def _layer(self, part: str, index: int) -> tuple[Tensor, Tensor]:
+        name = f"{part}.{index}"
+        return self.tensors[f"{name}.weight"], self.tensors[f"{name}.bias"]
 
     def save(self, path: Path) -> None:
         """Write the file."""
@@ -119,7 +121,7 @@ class ReactiveNetwork:
             "controller_id": self.controller_id,
             "provenance": dict(self.provenance),
         }
-        tensors = {name: tensor.contiguous() for name, tensor in self._tensors().items()}
+        tensors = {name: tensor.contiguous() for name, tensor in self.tensors.items()}
         metadata = {"schema": SCHEMA, "content": json.dumps(content, allow_nan=False)}
         write_bytes(path, save(tensors, metadata))
 
@@ -135,7 +137,16 @@ class ReactiveNetwork:
                 f"{path}: no such policy; expected a .safetensors file that egovcp-train-ppo wrote"
             )
         try:
-            return cls._from(read_tensor_file(path, _LIMIT_BYTES))
+            file = read_tensor_file(path, _LIMIT_BYTES)
+            if file.metadata.get("schema") != SCHEMA:
+                raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
+            content = decode(_Content, file.json_metadata("content"), "content")
+            file.require(tensor_shapes(content.config))
+            tensors = load(file.content)
+            if not all(tensor.isfinite().all() for tensor in tensors.values()):
+                raise ValueError("a number is not finite")
+            if (tensors["std"] <= 0).any():
+                raise ValueError("a standard deviation is not positive")
         except OSError as error:
             raise ArtifactError(f"{path}: {error.strerror}; it cannot be read") from error
         except (SafetensorError, ValueError) as error:
@@ -143,6 +154,7 @@ class ReactiveNetwork:
                 f"{path}: not a policy of schema {SCHEMA} ({error}); train one with "
                 "egovcp-train-ppo"
             ) from error
+        return cls(tensors, content.config, content.controller_id, content.provenance)
 
     def require_controller(self, controller_id: str) -> None:
         """Raise `ArtifactError` unless the robot has the controller of the training."""
@@ -151,64 +163,6 @@ class ReactiveNetwork:
                 f"this policy was trained with the low-level controller {self.controller_id}, the "
                 f"robot has {controller_id}; choose its --env.controller, or train again"
             )
-
-    @classmethod
-    def _from(cls, file: TensorFile) -> ReactiveNetwork:
-        if file.metadata.get("schema") != SCHEMA:
-            raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
-        content = decode(_Content, file.json_metadata("content"), "content")
-        file.require(tensor_shapes(content.config))
-        tensors = load(file.content)
-        return cls.of(tensors, content.config, content.controller_id, content.provenance)
-
-    @classmethod
-    def of(
-        cls,
-        tensors: Mapping[str, Tensor],
-        config: ReactiveConfig,
-        controller_id: str,
-        provenance: Mapping[str, Any],
-    ) -> ReactiveNetwork:
-        """A network from tensors with the names of `tensor_shapes`.
-
-        Raises:
-            KeyError: one is missing.
-            ValueError: one is not of its shape, or not finite.
-        """
-        network = cls(
-            tensors["mean"],
-            tensors["std"],
-            _layers(tensors, "cnn", len(KERNELS)),
-            _layers(tensors, "mlp", len(config.hidden) + 1),
-            config,
-            controller_id,
-            provenance,
-        )
-        network.check()
-        return network
-
-    def check(self) -> None:
-        """Raise ValueError unless tensors have the configured shapes and finite values."""
-        expected = tensor_shapes(self.config)
-        for name, tensor in self._tensors().items():
-            if tuple(tensor.shape) != expected[name]:
-                shape = tuple(tensor.shape)
-                raise ValueError(f"{name} has shape {shape}, expected {expected[name]}")
-            if tensor.dtype != torch.float32 or not tensor.isfinite().all():
-                raise ValueError(f"{name}: expected finite numbers of type float32")
-        if (self.std <= 0).any():
-            raise ValueError("a standard deviation is not positive")
-
-    def _tensors(self) -> dict[str, Tensor]:
-        tensors = {"mean": self.mean, "std": self.std}
-        for part, layers in (("cnn", self.cnn), ("mlp", self.mlp)):
-            for i, (weight, bias) in enumerate(layers):
-                tensors |= {f"{part}.{i}.weight": weight, f"{part}.{i}.bias": bias}
-        return tensors
-
-
-def _layers(tensors: Mapping[str, Tensor], part: str, count: int) -> tuple[Layer, ...]:
-    return tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(count))
 
 
 def tensor_shapes(config: ReactiveConfig) -> dict[str, tuple[int, ...]]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Final
 
 from egovcp.errors import UsageError
 
@@ -12,36 +12,12 @@ _TRACKER: Final = (
     "the ball tracker was removed and the world model learns from depth images alone: leave it out"
 )
 _HEADS: Final = "Q has one head, which reads the whole state: leave it out"
+_POSE: Final = "all tasks share one pose cost: use --env.pose_cost"
+_HIT: Final = "a touch of the body costs once: use --env.arch.hit_cost"
+_NO_TERM: Final = "its reward term was removed: leave it out"
+_WALL: Final = ("brace_reward", "upright_reward", "impact_cost", "impact_force", "guard_cost")
+_ARCH: Final = ("progress_reward", "crouch_cost", "near")
 
-#: Option, or group of options -> one sentence.
-REMOVED_OPTIONS: Final[Mapping[str, str]] = {
-    # egovcp-train
-    "value_fit": (
-        "Q is trained with the world model and not fitted again afterwards: leave it out"
-    ),
-    "passing": _TRACKER,
-    "policy.motion_ahead": _TRACKER,
-    "policy.paint_flight": _TRACKER,
-    "policy.value_of_passing": _TRACKER,
-    "policy.flight": _TRACKER,
-    "policy.loss.flight": _TRACKER,
-    "policy.loss.motion": _TRACKER,
-    "policy.loss.passing": _TRACKER,
-    "policy.loss.foresight_motion": _TRACKER,
-    "policy.value_state": _HEADS,
-    "policy.q_heads": _HEADS,
-    "policy.value_units": "the head of Q is as wide as every MLP: use --policy.units",
-    "planner.ensemble": _HEADS,
-    "sampling.event_fraction": (
-        "windows are drawn uniformly: leave it out; --sampling.tasks weights whole tasks"
-    ),
-    "datasets.return_steps": "all datasets have one horizon of returns: use --returns.steps",
-    # egovcp-experiment
-    "train.task_flags": "all tasks share one recipe: use --train.flags",
-    "play.task_flags": "all tasks share one recipe: use --play.flags",
-    # egovcp-eval-model
-    "return_steps": "Q is compared with the returns that it was trained on: leave it out",
-}
 #: Option of older versions -> its present name.
 RENAMED_OPTIONS: Final[Mapping[str, str]] = {
     "policy.loss.moving": "policy.loss.motion_weight",
@@ -55,6 +31,44 @@ RENAMED_OPTIONS: Final[Mapping[str, str]] = {
     "planner.process": "planner.action_parameterization",
     "robot.limits.picture_hold_s": "robot.limits.image_hold_s",
 }
+#: Option, or group of options -> one sentence.
+REMOVED_OPTIONS: Final[Mapping[str, str]] = {
+    **{old: f"its name is now {new}" for old, new in RENAMED_OPTIONS.items()},
+    **dict.fromkeys(("passing", "policy.motion_ahead", "policy.paint_flight"), _TRACKER),
+    **dict.fromkeys(("policy.value_of_passing", "policy.flight", "policy.loss.flight"), _TRACKER),
+    **dict.fromkeys(("policy.loss.motion", "policy.loss.passing"), _TRACKER),
+    "policy.loss.foresight_motion": _TRACKER,
+    **dict.fromkeys(("policy.value_state", "policy.q_heads", "planner.ensemble"), _HEADS),
+    "planner.hands_cost": (
+        "the planner computes the cost of the pose in the reward: use --planner.pose_cost"
+    ),
+    "planner.step_cost": (
+        "the planner computes the cost of action changes in the reward: use "
+        "--planner.action_rate_cost"
+    ),
+    "operator.gamepad": "use the robot's remote control, or --operator.type=keyboard",
+    "robot.bridge.consistency": "readings are always checked for consistency: leave it out",
+    "train.task_flags": "all tasks share one recipe: use --train.flags",
+    "play.task_flags": "all tasks share one recipe: use --play.flags",
+    "value_fit": "Q is trained with the world model and not fitted again afterwards: leave it out",
+    "policy.value_units": "the head of Q is as wide as every MLP: use --policy.units",
+    "optimizer.value_replay": (
+        "Q is fitted to a privileged value instead of single returns: leave it out"
+    ),
+    "sampling.event_fraction": (
+        "windows are drawn uniformly: leave it out; --sampling.tasks weights whole tasks"
+    ),
+    "datasets.return_steps": "all datasets have one horizon of returns: use --returns.steps",
+    **dict.fromkeys(("env.ball.pose_cost", "env.wall.pose_cost", "env.arch.pose_cost"), _POSE),
+    "env.wall.contact_cost": "a touch of the body costs once: use --env.wall.hit_cost",
+    **dict.fromkeys(("env.arch.contact_cost", "env.arch.head_cost"), _HIT),
+    **dict.fromkeys((f"env.wall.{name}" for name in _WALL), _NO_TERM),
+    **dict.fromkeys((f"env.arch.{name}" for name in _ARCH), _NO_TERM),
+    "env.arch.motion": (
+        "the robot always walks to the arch: leave it out, and use a controller that walks"
+    ),
+    "return_steps": "Q is compared with the returns that it was trained on: leave it out",
+}
 _INDEX: Final = re.compile(r"\[\d+\]")
 
 
@@ -63,9 +77,11 @@ class RemovedOptionError(UsageError):
 
 
 def refuse_removed_flag(flag: str) -> None:
-    """Raise `RemovedOptionError` if an unknown flag, such as ``--policy.x``, was removed."""
-    if reason := _reason(flag.removeprefix("--")):
-        raise RemovedOptionError(f"option {flag} was removed: {reason}")
+    """Raise `RemovedOptionError` if an unknown flag, or the group that contains it, was removed."""
+    parts = _INDEX.sub("", flag.removeprefix("--")).split(".")
+    for end in range(1, len(parts) + 1):
+        if reason := REMOVED_OPTIONS.get(".".join(parts[:end])):
+            raise RemovedOptionError(f"option {flag} was removed: {reason}")
 
 
 def refuse_preset_flag(flag: str) -> None:
@@ -74,40 +90,3 @@ def refuse_preset_flag(flag: str) -> None:
         f"option {flag} was removed from the command line: it is a constant of --preset; set it in "
         "a file, --config_path, or in Python"
     )
-
-
-def refuse_removed_options(options: Mapping[str, Any], file: str) -> None:
-    """Raise `RemovedOptionError`, which names all removed options of a configuration file.
-
-    Args:
-        options: the content of the file, nested by group.
-        file: its name, for the message.
-    """
-    found: dict[str, list[str]] = {}
-    for name, reason in _removed(options, ""):
-        found.setdefault(reason, []).append(name)
-    if found:
-        listed = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in found.items())
-        raise RemovedOptionError(f"{file} has options that were removed: {listed}")
-
-
-def _removed(value: object, name: str) -> Iterator[tuple[str, str]]:
-    """Name and reason of every removed option within a value."""
-    if reason := _reason(name):
-        yield name, reason
-    elif isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _removed(item, f"{name}.{key}" if name else str(key))
-    elif isinstance(value, Sequence) and not isinstance(value, str):
-        for index, item in enumerate(value):
-            yield from _removed(item, f"{name}[{index}]")
-
-
-def _reason(name: str) -> str | None:
-    """The reason of ``group.option``, or of the removed group that contains it."""
-    parts = _INDEX.sub("", name).split(".")
-    prefixes = (".".join(parts[:end]) for end in range(1, len(parts) + 1))
-    known = dict(REMOVED_OPTIONS) | {
-        old: f"its name is now {new}" for old, new in RENAMED_OPTIONS.items()
-    }
-    return next((known[p] for p in prefixes if p in known), None)

@@ -33,9 +33,6 @@ CONTROLLER_TICKS_PER_PLAN: Final = CONTROLLER_HZ // PLANNER_HZ  # 2
 PHYSICS_STEPS_PER_CONTROLLER_TICK: Final = round(1 / (CONTROLLER_HZ * PHYSICS_DT))  # 4
 PLANNER_DT: Final = 1.0 / PLANNER_HZ  # s
 
-# --- tasks -----------------------------------------------------------------------
-TASKS: Final = ("ball", "wall", "arch")
-
 # --- depth -----------------------------------------------------------------------
 DEPTH_ROWS: Final = 48
 DEPTH_COLS: Final = 64
@@ -160,6 +157,16 @@ ACTION_BOX: Final = ActionBox(
     high=(0.55, 0.42, 0.50, 0.55, 0.08, 0.50, 0.76),
 )
 
+# --- reward ----------------------------------------------------------------------
+#: Reward terms in datasets; their sum is the reward. A task's own terms are stored in one of these:
+#: a wanted contact, another achievement, an unwanted contact or state, and those of every task.
+REWARD_TERMS: Final = ("block", "pass", "hit", "fall", "pose", "action_rate")
+#: Terms that are functions of the actions alone: the planner computes them, Q learns the others.
+ACTION_TERMS: Final = ("pose", "action_rate")
+POSE_COST: Final = 0.02  # per planner tick, times the mean squared action; 0 in the neutral pose
+#: Per planner tick, times the mean squared change of the action over `ACTION_RATE_LIMIT`.
+ACTION_RATE_COST: Final = 0.05
+
 # --- LeRobot feature names ---------------------------------------------------------
 DEPTH_KEY: Final = "observation.images.ego_depth"
 STATE_KEY: Final = "observation.state"
@@ -168,6 +175,15 @@ REWARD_KEY: Final = "next.reward"
 DONE_KEY: Final = "next.done"
 SUCCESS_KEY: Final = "next.success"
 TRUNCATED_KEY: Final = "next.truncated"
+REWARD_TERMS_KEY: Final = "reward_terms"
+OBJECT_KEY: Final = "privileged.object"  # of the simulator: trained on, never an input of a policy
+#: Position of the task's object (m, heading frame), and whether it is known (1) or zeros (0).
+OBJECT_NAMES: Final = ("x", "y", "z", "known")
+OBJECT_DIM: Final = len(OBJECT_NAMES)
+#: In the features of `egovcp.data.privileged`: position (m) and velocity (m/s) of
+#: the object when it was last known, heading frame, and whether it is known now.
+OBJECT_STATE: Final = slice(0, 6)
+OBJECT_KNOWN: Final = 6
 CONTROLLER_ID_KEY: Final = "controller_id"  # of the low-level controller, in LeRobot's `info`
 
 #: LeRobot feature descriptions of the columns egovcp adds to the standard ones.
@@ -188,7 +204,15 @@ FEATURES: Final[dict[str, dict[str, object]]] = {
     DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
     SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
     TRUNCATED_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+    REWARD_TERMS_KEY: {
+        "dtype": "float32",
+        "shape": (len(REWARD_TERMS),),
+        "names": list(REWARD_TERMS),
+    },
+    OBJECT_KEY: {"dtype": "float32", "shape": (OBJECT_DIM,), "names": list(OBJECT_NAMES)},
 }
+#: Columns that datasets of earlier versions lack; they are read as zeros.
+OPTIONAL_KEYS: Final = (REWARD_TERMS_KEY, OBJECT_KEY)
 
 # --- returns (paper eq. 9; DESIGN of the Monte Carlo target) ------------------------
 GAMMA: Final = 0.97

@@ -9,6 +9,7 @@ from torch import nn
 
 from egovcp import spec
 from egovcp.data.episode import Episode
+from egovcp.data.privileged import DIM as PRIVILEGED_DIM
 from egovcp.model import PRESETS, Batch, WorldModel, WorldModelConfig
 
 __all__ = ["random_batch", "random_episode", "toy_model"]
@@ -53,6 +54,7 @@ def random_batch(size: int = 4, length: int = 8, seed: int = 0) -> Batch:
         mc_valid=torch.ones(shape, dtype=torch.bool),
         terminal_next=torch.zeros(shape, dtype=torch.bool),
         reward=torch.randn(shape, generator=rng),
+        privileged=torch.randn((*shape, PRIVILEGED_DIM), generator=rng),
     )
 
 
@@ -70,17 +72,21 @@ def random_episode(
     depth = rng.integers(280, 5000, pixels).astype(np.uint16)
     depth[rng.random(pixels) < 0.1] = 0
     action = rng.uniform(-1, 1, (length, spec.ACTION_DIM)).astype(np.float32)
+    terms = rng.normal(size=(length, len(spec.REWARD_TERMS))).astype(np.float32)
+    terms[:, -len(spec.ACTION_TERMS) :] = 0.0  # not in the target of Q
     return Episode(
         depth=depth,
         state=_state(rng, action),
         action=action,
-        reward=rng.normal(size=length).astype(np.float32),
+        reward=terms.sum(1),
         done=last,
         success=rng.random(length) < 0.1,
         truncated=last & (length == limit),
         task=task,
         time_limit=limit,
         metadata={"seed": seed, "episode": number, "ball": {"radius": 0.1}},
+        reward_terms=terms,
+        object=np.column_stack([rng.normal(size=(length, 3)), np.ones(length)]).astype(np.float32),
     )
 
 

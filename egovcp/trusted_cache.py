@@ -7,12 +7,10 @@ stored in ``NAME.sha256``, in the format of ``sha256sum``.
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import hashlib
 import os
 import secrets
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +20,6 @@ from egovcp.errors import EnvironmentFailure
 
 _WRITABLE_BY_OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
 _LARGEST_FILE: Final = 64 << 20
-_loaded_descriptors: list[int] = []
 
 
 def user_cache_folder() -> Path | None:
@@ -119,32 +116,17 @@ class TrustedCache:
 
 
 def load_library(content: bytes, name: str) -> ctypes.CDLL:
-    """Load a shared library from memory, so that it cannot change after its check.
-
-    Args:
-        name: its name in debuggers and profilers.
+    """Load a shared library from memory (Linux); debuggers show its name.
 
     Raises:
-        OSError: it is not a library for this machine.
+        OSError: it is not a library for this machine, or there is no /proc.
     """
-    if hasattr(os, "memfd_create"):
-        descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        try:
-            with os.fdopen(descriptor, "wb", closefd=False) as file:
-                file.write(content)
-            seals = fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
-            library = ctypes.CDLL(f"/proc/self/fd/{descriptor}")
-        except OSError:
-            os.close(descriptor)  # no /proc, or memory files are not executable: use a private file
-        else:
-            # The loader identifies libraries by path, so the descriptor must stay open.
-            _loaded_descriptors.append(descriptor)
-            return library
-    with tempfile.TemporaryDirectory(prefix="egovcp-") as folder:
-        path = Path(folder) / name
-        path.write_bytes(content)
-        return ctypes.CDLL(str(path))
+    if not hasattr(os, "memfd_create"):
+        raise OSError("only Linux loads libraries from memory")
+    descriptor = os.memfd_create(name)  # stays open: the loader identifies libraries by path
+    with os.fdopen(descriptor, "wb", closefd=False) as file:
+        file.write(content)
+    return ctypes.CDLL(f"/proc/self/fd/{descriptor}")
 
 
 def _make_private(folder: Path) -> None:

@@ -1,13 +1,14 @@
 """Parses values of options and builds configuration dataclasses.
 
 Types of options: str, int, float, bool, `Literal`, tuple, list, dict with str keys, dataclass, and
-unions with None. Collections are written in YAML, with ``(1, 2)`` as another form of ``[1, 2]``.
-Numbers may be text, as on a command line; `egovcp.decode` reads untrusted JSON without conversions.
+unions with None. Collections are written in YAML; a list may be ``(1, 2)``.
+Numbers may be text, as on a command line; with ``strict``, for JSON, they may not.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -18,6 +19,7 @@ from draccus import cfgparsing
 
 from egovcp.bounds import OutOfBounds, as_flag_value
 from egovcp.errors import UsageError, did_you_mean
+from egovcp.files import check_depth
 from egovcp.removed_options import refuse_removed_flag
 
 _BOOLEANS: Final[Mapping[str, bool]] = {
@@ -31,7 +33,6 @@ _INT_LIMIT: Final = 2**63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
 """The option that is probably meant by the name of a group such as ``--dataset``."""
 _SHOWN_OPTIONS: Final = 6
-_NESTING_LIMIT: Final = 32
 
 
 class WrongValue(UsageError):
@@ -62,6 +63,17 @@ def type_name(kind: Any) -> str:
     return names.get(kind) or str(kind.__name__)
 
 
+def choices(kind: Any) -> tuple[str, ...]:
+    """The values of a boolean or a literal, also in a union; empty for other types."""
+    if kind is bool:
+        return ("true", "false")
+    parts = get_args(kind)
+    if get_origin(kind) is Literal:
+        return tuple(map(str, parts))
+    is_union = get_origin(kind) in (Union, UnionType)
+    return tuple(name for part in parts for name in choices(part)) if is_union else ()
+
+
 @cache
 def option_types(config_class: type) -> Mapping[str, Any]:
     """Option -> type of a dataclass."""
@@ -81,27 +93,35 @@ def is_collection(kind: Any) -> bool:
 
 
 def parse_collection(text: str) -> Any:
-    """The value of a YAML text, in which lists may be in parentheses.
+    """The value of a YAML text; a list may be in parentheses.
 
     Raises:
-        ValueError: invalid YAML.
+        ValueError: invalid YAML, or nested too deeply.
     """
+    check_depth(text)
+    stripped = text.strip()
+    if stripped.startswith("(") and stripped.endswith(")"):
+        text = f"[{stripped[1:-1]}]"
     try:
-        return cfgparsing.parse_string(_with_brackets(text))
+        return cfgparsing.parse_string(text)
     except Exception as error:
         raise ValueError(" ".join(str(error).split())) from error
 
 
 def build[C](
-    config_class: type[C], values: Mapping[str, Any], prefix: str, default: C | None = None
+    config_class: type[C],
+    values: Mapping[str, Any],
+    prefix: str,
+    default: C | None = None,
+    strict: bool = False,
 ) -> C:
     """An instance of a dataclass.
 
     Args:
-        config_class: the dataclass.
         values: option -> value; options may be missing.
         prefix: prefix of option names in messages, ``--env.``.
         default: an instance with the values of missing options; None: the defaults of the class.
+        strict: see `convert`.
 
     Raises:
         WrongValue: an option is unknown, required and missing, or has another type.
@@ -117,9 +137,9 @@ def build[C](
     found: dict[str, Any] = {}
     for key, field in options.items():
         base = default_of(field) if default is None else getattr(default, key)
-        found[key] = (
-            convert(kinds[key], values[key], f"{prefix}{key}", base) if key in values else base
-        )
+        found[key] = base
+        if key in values:
+            found[key] = convert(kinds[key], values[key], f"{prefix}{key}", base, strict)
         if found[key] is dataclasses.MISSING:
             raise WrongValue(f"option {prefix}{key} is missing")
     try:
@@ -128,59 +148,61 @@ def build[C](
         raise error.with_prefix(prefix) from None
 
 
-def convert(kind: Any, value: Any, name: str, default: Any = None) -> Any:
+def convert(kind: Any, value: Any, name: str, default: Any = None, strict: bool = False) -> Any:
     """The value converted to a type.
 
     Args:
-        kind: the type.
         value: a Python value, or text from a command line.
         name: of the option, for messages.
         default: for a dataclass: an instance with the values of missing options.
+        strict: refuse text for other types, and numbers that are not finite.
 
     Raises:
         WrongValue: the value has another type.
     """
     origin, args = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
     if origin in (Union, UnionType):
-        null = value is None or (isinstance(value, str) and value.lower() in _NULL)
-        if null and NoneType in args:
+        is_null = isinstance(value, str) and value.lower() in _NULL and not strict
+        if NoneType in args and (value is None or is_null):
             return None
-        return _convert_union(kind, value, name)
+        return _convert_union(kind, value, name, strict)
     if is_dataclass_type(kind):
         if not isinstance(value, Mapping):
             raise WrongValue.of(name, value, kind, _options_of(kind, value, name))
         base = default if isinstance(default, kind) else None
-        return build(kind, value, f"{name}.", base)
+        return build(kind, value, f"{name}.", base, strict)
     if origin in (tuple, list):
-        return origin(_items(kind, value, name))
+        return origin(_items(kind, value, name, strict))
     if origin is dict:
         if not isinstance(value, Mapping):
             raise WrongValue.of(name, value, kind)
         keys = [_text(key, name) for key in value]
-        return {key: convert(args[1], value[key], f"{name}.{key}") for key in keys}
+        return {k: convert(args[1], value[k], f"{name}.{k}", strict=strict) for k in keys}
     if kind is str:
         return _text(value, name)
-    found = _scalar(kind, value)
+    found = _scalar(kind, value, strict)
     if found is None:
         near = did_you_mean(value, args) if origin is Literal and isinstance(value, str) else ""
         raise WrongValue.of(name, value, kind, near)
     return found
 
 
-def _convert_union(kind: Any, value: Any, name: str) -> Any:
+def _convert_union(kind: Any, value: Any, name: str, strict: bool) -> Any:
     for part in get_args(kind):
         if part is not NoneType:
             try:
-                return convert(part, value, name)
+                return convert(part, value, name, strict=strict)
             except WrongValue:
                 continue
     raise WrongValue.of(name, value, kind)
 
 
-def _items(kind: Any, value: Any, name: str) -> Iterator[Any]:
+def _items(kind: Any, value: Any, name: str, strict: bool) -> Iterator[Any]:
     """The items of a tuple or a list, converted."""
     args = get_args(kind)
-    if isinstance(value, str) and value.strip().startswith(("(", "[")):
+    if isinstance(value, str) and value.strip().startswith(("(", "[")) and not strict:
         value = collection_or_text(value)  # a tuple in YAML
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise WrongValue.of(name, value, kind)
@@ -190,10 +212,10 @@ def _items(kind: Any, value: Any, name: str) -> Iterator[Any]:
         raise WrongValue.of(name, value, kind)
     for index, (part, item) in enumerate(zip(kinds, value, strict=True)):
         if is_dataclass_type(part):
-            yield convert(part, item, f"{name}[{index}]")
+            yield convert(part, item, f"{name}[{index}]", strict=strict)
             continue
         try:
-            yield convert(part, item, name)
+            yield convert(part, item, name, strict=strict)
         except WrongValue:
             raise WrongValue.of(name, value, kind) from None
 
@@ -219,10 +241,12 @@ def _text(value: Any, name: str) -> str:
     return value
 
 
-def _scalar(kind: Any, value: Any) -> Any:
+def _scalar(kind: Any, value: Any, strict: bool) -> Any:
     """A number, a boolean or a literal; None: the value has another type."""
     if get_origin(kind) is Literal:
         return next((v for v in get_args(kind) if v == value and type(v) is type(value)), None)
+    if strict and isinstance(value, str):
+        return None
     if kind is bool:
         if isinstance(value, str):
             return _BOOLEANS.get(value.lower())
@@ -235,9 +259,10 @@ def _scalar(kind: Any, value: Any) -> Any:
         return value if isinstance(value, int) and abs(value) < _INT_LIMIT else None
     if kind is float and isinstance(value, int | float | str):
         try:
-            return float(_YAML_FLOATS.get(value, value))
+            number = float(_YAML_FLOATS.get(value, value))
         except (ValueError, OverflowError):
             return None
+        return None if strict and not math.isfinite(number) else number
     return None
 
 
@@ -257,31 +282,3 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
-
-
-def _with_brackets(text: str) -> str:
-    """The text with parentheses of lists replaced by brackets.
-
-    Raises:
-        ValueError: it is nested too deeply.
-    """
-    out: list[str] = []
-    opened: list[str] = []
-    quote, before = "", ""  # open quote; last character that is not a space
-    for character in text:
-        starts = before in "[{(,:"  # a value can start here
-        written = character
-        if quote:
-            quote = "" if character == quote else quote
-        elif starts and character in "'\"":
-            quote = character
-        elif character in "[{" or (starts and character == "(" and (opened or not before)):
-            opened.append(character)
-            if len(opened) > _NESTING_LIMIT:
-                raise ValueError(f"nested more than {_NESTING_LIMIT} deep")
-            written = "[" if character == "(" else character
-        elif opened and character == {"[": "]", "{": "}", "(": ")"}[opened[-1]]:
-            written = "]" if opened.pop() == "(" else character
-        out.append(written)
-        before = before if character.isspace() else character
-    return "".join(out)

@@ -69,26 +69,17 @@ def stop_on_signal(
             signal.signal(number, handler)
 
 
-def ray_package(distribution: str) -> Any:
-    """The package `ray`, which is optional.
-
-    Args:
-        distribution: the distribution whose extra `ray` installs it.
-
-    Raises:
-        MissingPackage: it is not installed.
-    """
-    require_packages(distribution, "--backend=ray", "ray")
-    return importlib.import_module("ray")
-
-
 def connect(distribution: str) -> Any:
     """Connect to the cluster of ``RAY_ADDRESS``, or start a local one; returns the package `ray`.
+
+    Args:
+        distribution: the distribution whose extra `ray` installs Ray.
 
     Raises:
         EnvironmentFailure: Ray is not installed, or the cluster cannot be reached.
     """
-    ray = ray_package(distribution)
+    require_packages(distribution, "--backend=ray", "ray")
+    ray: Any = importlib.import_module("ray")
     address = os.environ.get("RAY_ADDRESS")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     own = {} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}

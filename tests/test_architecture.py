@@ -93,6 +93,19 @@ def test_a_reading_of_the_wall_clock_would_be_found(tmp_path: Path) -> None:
     assert wall_clock_readings(tmp_path / "late.py") == ["late.py: time.time"]
 
 
+#: Where tasks may be named: in themselves, in the paper's experiments, and in what makes up
+#: episodes for tests.
+_NAMING = ("egovcp/sim/tasks", "experiment/egovcp_experiment", "egovcp/testing.py")
+
+
+def test_only_tasks_name_tasks() -> None:
+    word = re.compile('"(ball|wall|arch)"')
+    files = [path for package in PACKAGES.values() for path in sorted(package.rglob("*.py"))]
+    naming = [str(p.relative_to(ROOT)) for p in files if word.search(p.read_text(encoding="utf-8"))]
+    assert [name for name in naming if not name.startswith(_NAMING)] == []
+    assert any(name.startswith(_NAMING[0]) for name in naming)
+
+
 @pytest.mark.parametrize("package", ["model", "plan", "log", "robot"])
 def test_generic_packages_know_nothing_of_balls(package: str) -> None:
     word = re.compile(r"\b(balls?|flights?|throws?|thrown)\b", re.IGNORECASE)

@@ -26,15 +26,22 @@ CONFIGS = {
     "egovcp-train-lowlevel": "egovcp_train.lowlevel.train:LowLevelTrainConfig",
     "egovcp-eval-lowlevel": "egovcp_train.lowlevel.evaluate:LowLevelEvalConfig",
     "egovcp-train-ppo": "egovcp_train.ppo.config:PpoTrainConfig",
-    "egovcp-tune-gait": "egovcp_train.lowlevel.tune:TuneConfig",
     "egovcp-deploy": "egovcp_deploy.config:DeployConfig",
+    "egovcp-demo": "egovcp_deploy.demo:DemoConfig",
     "egovcp-eval": "egovcp_deploy.evaluate:EvalConfig",
     "egovcp-fake-g1": "egovcp_deploy.robots.fake.command:FakeG1Config",
     "egovcp-depth-server": "egovcp_deploy.robots.depth_server:DepthServerConfig",
     "egovcp-experiment": "egovcp_experiment.config:ExperimentConfig",
 }
 #: Those whose options hold no number, or are looked up by the name of what they shall do.
-WITHOUT = {"egovcp-push", "egovcp-export", "egovcp-compare", "egovcp-dataset", "egovcp-mcap"}
+WITHOUT = {
+    "egovcp-push",
+    "egovcp-export",
+    "egovcp-compare",
+    "egovcp-dataset",
+    "egovcp-mcap",
+    "egovcp-task",
+}
 
 
 def _default(command: str) -> Any:
@@ -168,7 +175,6 @@ def test_a_cluster_has_other_cores(monkeypatch: pytest.MonkeyPatch) -> None:
         ("egovcp-train", ["--sampling.length=100000", "--batch_size=2"]),
         ("egovcp-train-ppo", ["--robots=65536"]),
         ("egovcp-train-lowlevel", ["--robots=65536"]),
-        ("egovcp-tune-gait", ["--population=65536"]),
     ],
 )
 def test_more_than_the_memory_holds_is_refused(

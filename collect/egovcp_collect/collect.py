@@ -16,7 +16,7 @@ from typing import Any, Final
 from tqdm import tqdm
 
 from egovcp import spec
-from egovcp.cli import run_command
+from egovcp.cli import preset_defaults, run_command
 from egovcp.data import tiff
 from egovcp.data.committer import Committer, open_committer
 from egovcp.data.source import local_root
@@ -27,7 +27,7 @@ from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_collect.config import CollectConfig
+from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_collect.provenance import make_provenance, require_compatible
 from egovcp_collect.worker_pool import WorkerPool
 from egovcp_collect.workers import Backend, LocalBackend
@@ -40,7 +40,7 @@ _EPILOG: Final = (
 STAGED_FRAME_BYTES: Final = (
     len(tiff.header(spec.DEPTH_ROWS, spec.DEPTH_COLS))
     + 2 * spec.DEPTH_ROWS * spec.DEPTH_COLS
-    + 4 * (spec.STATE_DIM + spec.ACTION_DIM + 1)
+    + 4 * (spec.STATE_DIM + spec.ACTION_DIM + 1 + len(spec.REWARD_TERMS) + spec.OBJECT_DIM)
 )
 """Bytes of a frame in a staged episode, which is not compressed."""
 MIN_COMPRESSED_SHARE: Final = 0.2
@@ -52,7 +52,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = sys.argv[1:] if argv is None else list(argv)
     command = shlex.join([PROG, *args])
     return run_command(
-        CollectConfig, partial(collect, command=command), args, prog=PROG, epilog=_EPILOG
+        CollectConfig,
+        partial(collect, command=command),
+        args,
+        prog=PROG,
+        epilog=_EPILOG,
+        defaults=partial(preset_defaults, PRESETS),
     )
 
 
@@ -73,7 +78,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
     config.check()
     if config.backend == "ray":
         require_packages("egovcp-collect", "--backend=ray", "ray")
-    config = replace(config, env=resolve_config(config.env))
+    config = replace(config, env=resolve_config(config.env, config.tasks))
     provenance = make_provenance(config, command)
     check_existing = partial(require_compatible, provenance) if config.resume else None
     root = local_root(config.dataset)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -10,37 +11,29 @@ from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
-from egovcp.sim.config import EnvConfig, require_memory_for_robots
+from egovcp.sim.config import EnvConfig, require_memory_for_robots, short_episodes
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
+from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
+from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT
 
-ALL_TASKS: Final = "all"
 #: Options that determine the content of an episode; the others only schedule the work.
 EPISODE_OPTIONS: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
 
 
 @dataclass(frozen=True)
-class MixConfig:
-    """Relative weight of each task under --task=all."""
-
-    ball: float = bounded(1.0, least=0)
-    """Weight of ball episodes."""
-    wall: float = bounded(1.0, least=0)
-    """Weight of wall episodes."""
-    arch: float = bounded(1.0, least=0)
-    """Weight of arch episodes."""
-
-
-@dataclass(frozen=True)
 class CollectConfig:
-    """Simulate episodes under the random walk of the paper; write them as a LeRobot dataset."""
+    """Simulate episodes under random actions; write them as a LeRobot dataset."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The new dataset; without a root it goes to LeRobot's local folder under its id."""
-    task: str = "ball"
-    """Task to collect: ball, wall, arch, or all of them interleaved."""
-    mix: MixConfig = field(default_factory=MixConfig)
-    """Weights of the tasks under --task=all."""
+    task: str = DEFAULT_TASK
+    """Task to collect: one of `egovcp-task list`, package.module:Class, several as ball,wall, or
+    all. Several are interleaved."""
+    preset: str = "default"
+    """Starting point of all options: default (actions change every 5 to 15 steps, short episodes),
+    or paper (actions change at every step, episodes of 6 s)."""
+    mix: dict[str, float] = bounded({}, least=0)
+    """Relative number of planner steps of each of several tasks, '{ball: 2}'; 1 for others."""
     episodes: int = bounded(200, least=1, most=10**6)
     """Number of episodes, including those that --resume finds."""
     resume: bool = False
@@ -58,28 +51,29 @@ class CollectConfig:
     """Replace a worker that sends no report for this long, s."""
     num_envs: int = bounded(16, least=1, most=65_536)
     """Robots that each process simulates in parallel."""
-    eta: float = bounded(ACTION_ETA, above=0, most=2)
+    eta: float = bounded(1.0, above=0, most=2)
     """Largest step of the random walk, action box units; a step above the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
-    step_ticks: tuple[int, int] = bounded((1, 1), least=1, most=100_000)
+    step_ticks: tuple[int, int] = bounded((5, 15), least=1, most=100_000)
     """Shortest and longest interval between steps of the walk, planner ticks; (1, 1) is the
     paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """How the walk stays inside the action box; clipping accumulates actions on its faces."""
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=short_episodes)
     """Scenes, sensors, delays and randomisation."""
 
     def check(self) -> None:
         """Raise `UsageError` for invalid values and combinations."""
         check_bounds(self, "--")
+        if self.preset not in PRESETS:
+            raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         if self.backend == "local":  # a cluster has other cores and other memory
             require_cores("--num_workers", self.num_workers)
             workers = self.num_workers or available_cores()
             robots = min(self.num_envs * workers, self.episodes)
             require_memory_for_robots("--num_envs", self.num_envs, robots)
-        choices = (*TASKS, ALL_TASKS)
-        if self.task not in choices:
-            raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")
+        for task in set(self.mix) - set(select_tasks(self.task, training=True)):
+            raise UsageError(f"--mix.{task}: --task={self.task} does not have this task")
         shortest, longest = self.step_ticks
         if shortest > longest:
             raise UsageError(
@@ -93,24 +87,47 @@ class CollectConfig:
                 f"the rate limit of {ACTION_RATE_LIMIT} per tick allows within "
                 f"--step_ticks={[shortest, longest]}"
             )
-        if not any(self._weights()):
-            raise UsageError(f"{self.mix}: expected at least one of the weights above 0")
+        if not self._weights():
+            raise UsageError(f"--mix={self.mix}: expected at least one weight above 0")
         if self.dataset.revision:
             raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
 
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks of the episodes."""
+        return tuple(self._weights())
+
     def scenarios(self) -> tuple[Scenario, ...]:
-        """The episodes in order. Tasks interleave so that every prefix has the shares of `mix`."""
-        if self.task != ALL_TASKS:
-            return tuple(Scenario(self.task, self.seed, i) for i in range(self.episodes))
-        weights = self._weights()
-        counts = [0] * len(TASKS)
+        """The episodes in order. Tasks interleave so that every prefix has the shares of `mix`.
+
+        The planned length of an episode counts, whether or not a fall ends it earlier.
+        """
+        weights = {
+            task: weight / self.env.episode(task).ticks for task, weight in self._weights().items()
+        }
+        total, counts = sum(weights.values()), dict.fromkeys(weights, 0)
         scenarios = []
         for i in range(self.episodes):
-            due = [w * (i + 1) / sum(weights) - n for w, n in zip(weights, counts, strict=True)]
-            k = max(range(len(TASKS)), key=due.__getitem__)
-            counts[k] += 1
-            scenarios.append(Scenario(TASKS[k], self.seed, i))
+            task = max(weights, key=lambda t: weights[t] * (i + 1) / total - counts[t])
+            counts[task] += 1
+            scenarios.append(Scenario(task, self.seed, i))
         return tuple(scenarios)
 
-    def _weights(self) -> tuple[float, ...]:
-        return tuple(getattr(self.mix, task) for task in TASKS)
+    def _weights(self) -> dict[str, float]:
+        """Task -> weight, of those above 0."""
+        weights = {task: self.mix.get(task, 1.0) for task in select_tasks(self.task, training=True)}
+        return {task: weight for task, weight in weights.items() if weight}
+
+
+def default() -> CollectConfig:
+    """Hands that stay where the random walk puts them, in short episodes."""
+    return CollectConfig()
+
+
+def paper() -> CollectConfig:
+    """The paper's random walk (section III-B), in episodes as they are evaluated."""
+    return CollectConfig(preset="paper", eta=ACTION_ETA, step_ticks=(1, 1), env=EnvConfig())
+
+
+#: Name -> function that returns the complete configuration.
+PRESETS: Final[Mapping[str, Callable[[], CollectConfig]]] = {"default": default, "paper": paper}

@@ -11,13 +11,12 @@ import draccus
 
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
+from egovcp.flags import merged
 from egovcp.robot.controllers import make_controller
-from egovcp.spec import TASKS
-from egovcp_collect.config import ALL_TASKS, EPISODE_OPTIONS, CollectConfig
+from egovcp.sim.tasks.registry import ALL_TASKS, task_names
+from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 
 _PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy")
-#: Task -> value that an option had before it existed, where that is not its default today.
-_IMPLICIT_SETTINGS: Final[Mapping[str, Any]] = {"wall": {"env": {"wall": {"guard_cost": 0.0}}}}
 _SHOWN_DIFFERENCES: Final = 5
 
 
@@ -29,7 +28,11 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
         seed=config.seed,
         command=command,
         versions=installed_versions(),
-        config={name: settings[name] for name in EPISODE_OPTIONS},
+        config={
+            **{name: settings[name] for name in EPISODE_OPTIONS},
+            "task": ",".join(config.tasks),  # what `all` means depends on what is installed
+            "mix": {task: config.mix[task] for task in config.tasks if task in config.mix},
+        },
     )
 
 
@@ -40,21 +43,20 @@ def installed_versions() -> dict[str, str]:
 
 
 def migrate_config(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Recorded `EPISODE_OPTIONS`, with options that are newer than the record filled in."""
+    """Recorded `EPISODE_OPTIONS`, with options that are newer than the record filled in, and
+    without those of tasks that are neither used nor installed."""
     defaults = draccus.encode(CollectConfig())
-    config = {name: defaults[name] for name in EPISODE_OPTIONS}
-    for task, settings in _IMPLICIT_SETTINGS.items():
-        if recorded.get("task") in (task, ALL_TASKS):
-            config = _merge(config, settings)
-    return _merge(config, recorded)
-
-
-def _merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
-    merged = {**base, **update}
-    for name, value in update.items():
-        if isinstance(value, Mapping) and isinstance(base.get(name), Mapping):
-            merged[name] = _merge(base[name], value)
-    return merged
+    config = merged({name: defaults[name] for name in EPISODE_OPTIONS}, recorded)
+    if config["task"] == ALL_TASKS:  # of earlier versions, whose mix has all tasks
+        config["task"] = ",".join(task for task, weight in config["mix"].items() if weight)
+    used = config["task"].split(",")
+    weights = config["mix"].items()
+    config["mix"] = {task: weight for task, weight in weights if task in used and weight != 1.0}
+    env = config["env"]
+    for task in [name for name in env if f"{name}_episode" in env]:
+        if task not in used and task not in defaults["env"]:
+            del env[task], env[f"{task}_episode"]
+    return config
 
 
 def require_compatible(now: Provenance, before: Provenance) -> None:
@@ -70,7 +72,7 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
-        **dict(_flat_pairs("--", migrate_config(before.config), now.config)),
+        **dict(_flat_pairs("--", migrate_config(before.config), migrate_config(now.config))),
         **dict(_flat_pairs("version of ", versions, now.versions)),
     }
     changed = {
@@ -94,11 +96,9 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
 
 def _unused_prefixes(*collections: Provenance) -> tuple[str, ...]:
     """Prefixes of the options of tasks that none of the collections has."""
-    tasks = {collection.config.get("task") for collection in collections}
-    if ALL_TASKS in tasks:
-        return ()
-    unused = [task for task in TASKS if task not in tasks]
-    return ("--mix.", *(f"--env.{task}{end}" for task in unused for end in (".", "_episode.")))
+    used = {task for c in collections for task in migrate_config(c.config)["task"].split(",")}
+    unused = [task for task in task_names() if task not in used]
+    return tuple(f"--env.{task}{end}" for task in unused for end in (".", "_episode."))
 
 
 def _flat_pairs(

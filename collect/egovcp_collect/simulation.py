@@ -17,6 +17,7 @@ from egovcp.sim.instance import EnvInstance
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HANDS
+from egovcp.spec import REWARD_TERMS
 from egovcp_collect.config import CollectConfig
 
 #: Called with the environment and (B,) whether the episode of each row is running.
@@ -65,14 +66,14 @@ class Simulation:
         steps, episodes = 0, list[tuple[int, Episode]]()
         while not self.idle and time.monotonic() < end:
             env = self._start_waiting()
-            running = ~env.done
+            running, objects = ~env.done, env.known_objects()
             steps += int(running.sum())
             if self._on_step is not None:
                 self._on_step(env, running)
             result = env.step(self._policy.act(env))
             for row in np.flatnonzero(running).tolist():
                 instance, record = env.instances[row], self._records[row]
-                record.add(self._observation, result, row, instance)
+                record.add(self._observation, objects[row], result, row, instance)
                 if instance.done:
                     episodes.append((instance.scenario.episode, record.episode(instance)))
                     self._records[row] = EpisodeRecord()
@@ -109,8 +110,21 @@ class EpisodeRecord:
         self._term_ticks: Counter[str] = Counter()
         self._hand_contacts = self._other_contacts = 0
 
-    def add(self, before: Observation, result: StepResult, row: int, instance: EnvInstance) -> None:
-        """Append row ``row`` of the environment: the observation before a step, and its result."""
+    def add(
+        self,
+        before: Observation,
+        known_object: NDArray[np.float32],
+        result: StepResult,
+        row: int,
+        instance: EnvInstance,
+    ) -> None:
+        """Append row ``row`` of the environment: the observation before a step, the object (4,) at
+        that time, and the result of the step."""
+        columns = instance.task.reward_terms
+        terms = {name: float(result.reward_terms[name][row]) for name in columns}
+        sums: dict[str, float] = {}
+        for name, column in columns.items():
+            sums[column] = sums[column] + terms[name] if column in sums else terms[name]
         values = {
             "depth": before.depth[row].copy(),
             "state": before.state[row].copy(),
@@ -119,13 +133,14 @@ class EpisodeRecord:
             "done": result.terminated[row] | result.truncated[row],
             "success": result.success[row],
             "truncated": result.truncated[row],
+            "reward_terms": np.array([sums.get(name, 0.0) for name in REWARD_TERMS], np.float32),
+            "object": known_object,
         }
         for name, value in values.items():
             self._rows[name].append(value)
-        for name in instance.task.terms:
-            term = float(result.reward_terms[name][row])
-            self._term_sums[name] += term
-            self._term_ticks[name] += term != 0
+        for name in columns:
+            self._term_sums[name] += terms[name]
+            self._term_ticks[name] += terms[name] != 0
         touched = instance.task.forces > 0
         hands = touched[list(HANDS)]
         self._hand_contacts += int(hands.any())
@@ -148,7 +163,7 @@ class EpisodeRecord:
                 "scene": instance.task.parameters,
                 "reward_terms": {
                     name: {"sum": self._term_sums[name], "ticks": self._term_ticks[name]}
-                    for name in instance.task.terms
+                    for name in instance.task.reward_terms
                 },
                 "contact_ticks": {"hands": self._hand_contacts, "other": self._other_contacts},
             },

@@ -35,9 +35,7 @@ class WorkerPool:
     """Workers of a backend.
 
     Args:
-        backend: starts workers.
-        workers: how many.
-        scenarios: the episodes to simulate, in this order.
+        workers: how many to start.
         num_envs: episodes that each worker simulates in parallel.
         timeout: seconds without a report after which a worker is replaced.
     """

@@ -46,20 +46,16 @@ class Worker(Protocol):
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Append episodes to its queue."""
-        ...
 
     def poll(self) -> list[WorkerReport]:
         """Reports since the last call; does not block."""
-        ...
 
     @property
     def alive(self) -> bool:
         """Whether more reports can follow."""
-        ...
 
     def kill(self) -> None:
         """End it immediately; returns when it has ended."""
-        ...
 
 
 class Backend(Protocol):
@@ -67,20 +63,16 @@ class Backend(Protocol):
 
     def start(self) -> Worker:
         """Start a worker."""
-        ...
 
     @property
     def cores(self) -> int:
         """Processor cores that workers can use."""
-        ...
 
     def wait(self, seconds: float) -> None:
         """Block until a worker has reported or died, at most this long."""
-        ...
 
     def close(self) -> None:
         """Free the resources of the backend itself."""
-        ...
 
 
 def encode_episode(number: int, episode: Episode) -> EncodedEpisode:

@@ -9,8 +9,8 @@ from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
+from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.live.operators import GamepadOptions
 from egovcp_deploy.options import encoded
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
@@ -26,7 +26,7 @@ class RobotOptions:
     unitree_g1: a G1, or egovcp-fake-g1, behind LeRobot's bridge, on the wall clock. replay:
     recorded observations; the policy plans again, and nothing is driven."""
     recordings: str = ""
-    """For replay: an MCAP file, a folder of them, or a LeRobot dataset on disk."""
+    """For replay: an MCAP file, or a folder of them."""
     controller: str = "walk"
     """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; it must be
     that of the policy's data. The simulated robot uses --env.controller."""
@@ -43,15 +43,12 @@ class OperatorOptions:
     """Source of the requests to stand, arm, run, hold and stop; the remote control of a G1 works in
     addition."""
 
-    type: Literal["auto", "keyboard", "gamepad"] = "auto"
-    """auto: stands up, arms and runs automatically. keyboard: the keys of this terminal. gamepad:
-    a gamepad at this machine, on Linux."""
+    type: Literal["auto", "keyboard"] = "auto"
+    """auto: stands up, arms and runs automatically. keyboard: the keys of this terminal."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Velocity of auto while running: vx, vy (m/s), yaw rate (rad/s)."""
     duration: float = bounded(0.0, least=0)
     """How long auto runs before it holds and ends, s; 0: until interrupted."""
-    gamepad: GamepadOptions = field(default_factory=GamepadOptions)
-    """Which gamepad, and which of its buttons does what."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +72,11 @@ class DeployConfig:
     realtime: bool = False
     """Run the simulated robot on the wall clock, with the messages of a real one."""
     dry_run: bool = False
-    """Only check what a run needs, and print go or no-go per check; nothing moves."""
-    task: str = "ball"
-    """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
-    --env.sequence.parts). It is not an input of the policy."""
+    """Only check what a run of a unitree_g1 needs, and print go or no-go per check; nothing
+    moves."""
+    task: str = DEFAULT_TASK
+    """Scene of the simulated robot: one of `egovcp-task list`, such as ball or sequence (several in
+    one episode, --env.sequence.parts), or package.module:Class. It is no input of the policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
     seed: int = bounded(0, least=0)
@@ -88,7 +86,7 @@ class DeployConfig:
     log: LogOptions = field(default_factory=LogOptions)
     """Logs besides the MCAP file."""
     imagine: int = bounded(16, least=0, most=1000)
-    """How far ahead the world model predicts depth for the recordings, ticks of 40 ms; 0: not."""
+    """Horizon of the predicted depth images in the recordings, steps of 40 ms; 0: none."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 

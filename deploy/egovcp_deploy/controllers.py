@@ -19,6 +19,7 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
 from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import find_task
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.options import PLANNER, for_search
 from egovcp_deploy.scores import EpisodeScore, reward_per_step
@@ -31,13 +32,6 @@ CONSTANT: Final = "constant"
 PPO: Final = "ppo"
 CONTROLLERS: Final = (PLANNER, "hold", CONSTANT, "random", "oracle")
 
-#: Box units per task: forward, outward (left hand's y; the right hand mirrors it), up, height.
-_GRIDS: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
-    "ball": ((0.2, 0.45, 0.8), (0.0, -0.3, -0.6), (0.35, 0.6, 0.85), (0.0,)),
-    "wall": ((0.4, 0.8, 1.0), (0.0, -0.3), (0.3, 0.55, 0.8), (0.0,)),
-    "arch": ((0.0,), (0.0,), (0.0,), (0.0, -0.2, -0.4, -0.6, -0.8, -1.0)),
-    "sequence": ((0.2, 0.45), (0.0, -0.3), (0.35, 0.6), (0.0, -0.6, -1.0)),
-}
 _REDUCTION: Final = 4  # a quarter of the candidates advances to the next round
 _FIRST_ROUND: Final = 6  # scenarios that every candidate plays
 
@@ -69,7 +63,7 @@ class ReferencePolicy:
         state: NDArray[np.floating],
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
-        """The actions of the reference, without plans."""
+        """The actions of the reference; no plans."""
         return PolicyStep(self._policy.act(self._env))  # type: ignore[arg-type]  # float64
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
@@ -91,11 +85,12 @@ class BestConstant:
 
 
 def grid(task: str) -> list[Action]:
-    """Candidates: left-right symmetric poses, the neutral pose among them."""
+    """Candidates: left-right symmetric poses, the neutral pose among them; see
+    `Task.constant_poses`."""
     neutral = (0.0,) * ACTION_DIM
     poses = [
         (forward, outward, up, forward, 0.0 - outward, up, height)
-        for forward, outward, up, height in itertools.product(*_GRIDS[task])
+        for forward, outward, up, height in itertools.product(*find_task(task).constant_poses)
     ]
     return [neutral, *[pose for pose in poses if pose != neutral]]
 
@@ -106,17 +101,17 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
     Every candidate plays the same few scenarios; the best quarter play more of them, until one is
     left. The scenarios are those of `options.for_search`, which no evaluation plays."""
     scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
-    left, count = list(scores), _FIRST_ROUND
-    while len(left) > 1:
-        first = len(scores[left[0]])
+    candidates, count = list(scores), _FIRST_ROUND
+    while len(candidates) > 1:
+        first = len(scores[candidates[0]])
         scenarios = [for_search(task, seed, first + i) for i in range(count)]
-        for action, played in zip(left, play(left, scenarios), strict=True):
+        for action, played in zip(candidates, play(candidates, scenarios), strict=True):
             scores[action] += played
-        left.sort(key=lambda action: -reward_per_step(scores[action]))
-        left, count = left[: max(1, len(left) // _REDUCTION)], count * 2
-    best = scores[left[0]]
+        candidates.sort(key=lambda action: -reward_per_step(scores[action]))
+        candidates, count = candidates[: max(1, len(candidates) // _REDUCTION)], count * 2
+    best = scores[candidates[0]]
     rate = float(np.mean([score.success for score in best]))
-    return BestConstant(left[0], reward_per_step(best), rate, len(best))
+    return BestConstant(candidates[0], reward_per_step(best), rate, len(best))
 
 
 def load_constants(path: Path) -> dict[str, BestConstant]:

@@ -6,7 +6,6 @@ in this file have not been verified on hardware.
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -20,22 +19,22 @@ from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
+from egovcp.outputs import nearest_existing, require_writable
 from egovcp.plan import blank_observation, until
+from egovcp.policy_options import load_policy
 from egovcp.robot.controllers import make_controller
-from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, LINK_NAMES, link_transforms
-from egovcp.robot.stance import pelvis_height
+from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
 from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import open_camera
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
-from egovcp_deploy.pilot.planner import BUDGET_S
+from egovcp_deploy.pilot.pilot import posture
+from egovcp_deploy.pilot.planner import BUDGET_S, RolloutPolicy, backend_of
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.policy import RolloutPolicy, backend_of
-from egovcp_deploy.robots.base import DepthImage, LowState, projected_gravity
+from egovcp_deploy.robots.base import DepthImage, LowState, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
-from egovcp_deploy.robots.g1_variants import describe_variant
 from egovcp_deploy.robots.realsense_camera import RealSenseDepthCamera
 from egovcp_deploy.robots.subscriber import ArrivalStats
 from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
@@ -43,9 +42,7 @@ from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
 Array = NDArray[np.float64]
 type AnyCamera = ZmqDepthCamera | RealSenseDepthCamera
 
-FREE_BYTES: Final = 1_000_000_000  # an hour of recording is about 0.6 GB
-_DISK_BYTES: Final = 4_000_000
-_DISK_MS: Final = 200.0
+FREE_BYTES: Final = 1_000_000_000  # an hour of recording takes about 0.6 GB
 PLAN_BUDGET_MS: Final = 36.0
 _PLANS: Final = 50
 _WARM_UP: Final = 5
@@ -57,9 +54,6 @@ IMAGE_HZ: Final = 15.0
 MAX_OFFSET: Final = 1.5  # rad from neutral; the stand-up motion takes 3 s at 0.5 rad/s
 RANGE_MARGIN: Final = 0.1  # rad beyond the joint range; more is a wrong zero
 MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1.0
-POSTURE_TOLERANCE: Final = 0.15  # rad between the IMU and a pelvis above flat feet
-_SHOWN_OFFSET: Final = 0.1  # rad
-_FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
 
 
 @dataclass(frozen=True)
@@ -92,39 +86,39 @@ def conclude(results: Iterable[CheckResult]) -> None:
         if result.error is not None:
             errors.append(result.error)
     if errors:
-        echo(f"no-go: {len(errors)} of the above")
+        echo(f"no-go: {len(errors)} checks failed")
         raise errors[0]
     echo("go")
 
 
+def checks(config: DeployConfig) -> Iterator[CheckResult]:
+    """All checks of a run on a robot; a failed one does not prevent the others."""
+    yield check("disk", lambda: check_disk(Path(config.output_dir)))
+    artifact: Artifact | None = None
+    try:
+        artifact = load_policy(config.policy, config.planner)
+    except EgovcpError as error:
+        yield CheckResult("policy", "", error)
+    else:
+        policy = artifact.make_policy(1, config.seed)
+        finding = f"{artifact.path}, for the controller {artifact.controller_id}"
+        yield CheckResult("policy", finding)
+        yield check("planner", lambda: check_plan_time(policy))
+    yield from check_hardware(config, artifact)
+
+
 # --- this machine and the policy -------------------------------------------------------------
 def check_disk(folder: Path) -> str:
-    """Free space and write speed."""
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    """Free space; raises `EnvironmentFailure` if it is too small, or not writable."""
+    require_writable(folder)
+    existing = nearest_existing(folder)
     free = shutil.disk_usage(existing).free
     if free < FREE_BYTES:
         raise EnvironmentFailure(
             f"{free / 1e9:.1f} GB free at {existing}, expected {FREE_BYTES / 1e9:.0f} GB; "
             "free disk space, or choose another --output_dir"
         )
-    trial = existing / f".egovcp-dry-run-{os.getpid()}"
-    begin = time.perf_counter()
-    try:
-        with trial.open("wb") as file:
-            file.write(os.urandom(_DISK_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot write to {existing}: {error.strerror}") from error
-    finally:
-        trial.unlink(missing_ok=True)
-    ms = (time.perf_counter() - begin) * 1e3
-    if ms > _DISK_MS:
-        raise EnvironmentFailure(
-            f"writing {_DISK_BYTES / 1e6:.0f} MB to {existing} took {ms:.0f} ms, expected at most "
-            f"{_DISK_MS:.0f}; choose another --output_dir"
-        )
-    return f"{free / 1e9:.0f} GB free, {_DISK_BYTES / 1e3 / max(ms, 1e-3):.0f} MB/s"
+    return f"{free / 1e9:.0f} GB free"
 
 
 def check_plan_time(policy: RolloutPolicy) -> str:
@@ -217,9 +211,10 @@ def _robot_results(
             raise EnvironmentFailure(robot.refusal)
         return "none detected"
 
-    yield CheckResult("mode", describe_variant(reading.mode))
+    mode = f"mode machine {reading.mode}: 29 joints, waist free"
+    yield CheckResult("mode", robot.warning or mode)
     yield check("joints", lambda: joint_offsets(reading.joint_position))
-    yield check("posture", lambda: posture(reading.joint_position, reading.quaternion_w))
+    yield check("posture", lambda: check_posture(reading))
     yield check("motors", lambda: motors(measured))
     gap_ms = limits.state_hold_s * 1e3
     yield check("states", lambda: check_message_rate(states, STATE_HZ, gap_ms))
@@ -247,9 +242,8 @@ def measure(robot: BridgeRobot | None, camera: AnyCamera | None, seconds: float)
 
 
 def joint_offsets(position: Array) -> str:
-    """Offset of each joint (29,) rad from the neutral pose; too far from it to stand up, or outside
-    the joint's range, is a no-go."""
-    neutral = standing_pose(ACTION_BOX.neutral[-1]).joints
+    """Largest offset of the joints (29,) rad from the neutral pose; too far from it to stand up, or
+    outside the joint's range, is a no-go."""
     outside = np.maximum(JOINT_LOWER - position, position - JOINT_UPPER)
     i = int(np.argmax(outside))
     if outside[i] > RANGE_MARGIN:
@@ -257,52 +251,27 @@ def joint_offsets(position: Array) -> str:
             f"{JOINT_NAMES[i]} reports {position[i]:+.2f} rad, outside its range "
             f"{JOINT_LOWER[i]:.2f} to {JOINT_UPPER[i]:.2f}; calibrate its zero in Unitree's app"
         )
-    offset = position - neutral
-    i = int(np.argmax(np.abs(offset)))
-    if abs(offset[i]) > MAX_OFFSET:
+    neutral = standing_pose(ACTION_BOX.neutral[-1]).joints
+    i = int(np.argmax(np.abs(position - neutral)))
+    finding = f"{JOINT_NAMES[i]} is {position[i] - neutral[i]:+.2f} rad from neutral"
+    if abs(position[i] - neutral[i]) > MAX_OFFSET:
         raise EnvironmentFailure(
-            f"{JOINT_NAMES[i]} is {offset[i]:+.2f} rad from neutral, expected at most "
-            f"{MAX_OFFSET:g}; move it by hand to about {neutral[i]:+.2f} rad"
+            f"{finding}, expected at most {MAX_OFFSET:g}; move it by hand to about "
+            f"{neutral[i]:+.2f} rad"
         )
-    far = [
-        f"{name.removesuffix('_joint')} {value:+.2f}"
-        for name, value in zip(JOINT_NAMES, offset, strict=True)
-        if abs(value) >= _SHOWN_OFFSET
-    ]
-    near = f"{len(JOINT_NAMES) - len(far)} joints within {_SHOWN_OFFSET:g} rad of neutral"
-    return f"{near}; {', '.join(far)}" if far else near
+    return f"the farthest, {finding}"
 
 
-def posture(position: Array, quaternion_w: Array) -> str:
-    """The tilt of the pelvis according to the IMU, compared with a pelvis above flat feet. The
-    comparison is invalid while the feet are off the ground, so only a large tilt fails the check.
-
-    Args:
-        position: (29,) rad.
-        quaternion_w: (4,) orientation of the pelvis by the IMU.
-    """
-    gravity = projected_gravity(quaternion_w)
-    up = -gravity
-    tilt = float(np.arccos(np.clip(up[2], -1.0, 1.0)))
+def check_posture(reading: LowState) -> str:
+    """Tilt of the pelvis by the IMU, and its height above the lower foot; a large tilt is a
+    no-go."""
+    tilt, height = posture(proprioception(reading, np.zeros(10)))
     if tilt > MAX_TILT:
         raise EnvironmentFailure(
             f"according to the IMU the pelvis is tilted by {tilt:.2f} rad, expected at most "
             f"{MAX_TILT:g}; hang the robot up upright"
         )
-    rotation = link_transforms(position[None])[1][0, _FEET]  # (2, 3, 3)
-    soles = rotation[:, :, 2]  # the feet's upward axes in the pelvis frame
-    height = float(pelvis_height(position[None], gravity[None])[0])
-    apart = np.arccos(np.clip(soles @ up, -1.0, 1.0))
-    finding = (
-        f"IMU {tilt:.2f} rad from upright, pelvis {height:.2f} m above the lower foot; a pelvis "
-        f"above flat feet would differ by {apart[0]:.2f} (left) and {apart[1]:.2f} rad (right)"
-    )
-    if apart.max() <= POSTURE_TOLERANCE:
-        return finding
-    return (
-        f"{finding}; that is normal only while the feet hang in the air. If they stand flat on the "
-        "ground, calibrate the joints' zeros in Unitree's app"
-    )
+    return f"IMU {tilt:.2f} rad from upright, pelvis {height:.2f} m above the lower foot"
 
 
 def motors(measured: Measurements) -> str:

@@ -28,16 +28,17 @@ from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import PPO, ReferencePolicy, reference
 from egovcp_deploy.options import PLANNER
-from egovcp_deploy.policy import RolloutPolicy
-from egovcp_deploy.safety import SafetyFilter
+from egovcp_deploy.pilot.pilot import SafetyFilter
+from egovcp_deploy.pilot.planner import RolloutPolicy
 from egovcp_deploy.scores import EpisodeScore
+from egovcp_deploy.videos import VideoRecorder
 
 _POLL_S: Final = 0.2
 
 
 @dataclass(frozen=True)
 class EpisodeSetup:
-    """What all groups share; sent to each worker once."""
+    """Options that all groups share; sent to each worker once."""
 
     env: EnvConfig
     policy: PolicyOptions = field(default_factory=PolicyOptions)  # of the controller `planner`
@@ -53,6 +54,7 @@ class EpisodeGroup:
     controller: str
     scenarios: tuple[Scenario, ...]
     action: tuple[float, ...] = ()  # of the controller `constant`
+    videos: tuple[Path, ...] = ()  # of the first scenarios, without suffix
 
 
 class EpisodePlayer:
@@ -74,7 +76,8 @@ class EpisodePlayer:
         if size not in self._envs:
             self._envs[size] = VectorEnv(self._setup.env, size)
         env = self._envs[size]
-        return play(env, self._policy(group, env), group.scenarios, stopped)
+        recorder = VideoRecorder(group.videos)
+        return play(env, self._policy(group, env), group.scenarios, stopped, recorder)
 
     def _policy(self, group: EpisodeGroup, env: VectorEnv) -> RolloutPolicy:
         if group.controller not in (PPO, PLANNER):
@@ -101,31 +104,38 @@ def play(
     policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
     stopped: Callable[[], bool] = lambda: False,
+    recorder: VideoRecorder | None = None,
 ) -> list[EpisodeScore]:
-    """One episode per row of ``env``; returns the scores of the episodes that ended: all of them,
-    unless ``stopped()`` became true."""
+    """Play one episode on each instance of ``env``; returns the scores of the episodes that ended.
+
+    Unless ``stopped()`` becomes true, these are all, and ``recorder`` draws its videos.
+    """
     observation = env.reset(scenarios)
     policy.reset()
-    rows = env.num_envs
-    safety = SafetyFilter(rows)
-    rewards, plan_ms = np.zeros(rows), list[float]()
-    steps, skipped = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
-    success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-    terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-    parts: tuple[dict[str, bool], ...] = ({},) * rows
+    num_envs = env.num_envs
+    safety = SafetyFilter(num_envs)
+    rewards, plan_ms = np.zeros(num_envs), list[float]()
+    steps, skipped = np.zeros(num_envs, np.int64), np.zeros(num_envs, np.int64)
+    success: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
+    terminated: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
+    parts: tuple[dict[str, bool], ...] = ({},) * num_envs
     while not env.done.all() and not stopped():
         live = ~env.done
         begin = time.perf_counter()
         step = policy.act(observation.depth, observation.state)
-        plan_ms.append((time.perf_counter() - begin) * 1e3 / rows)
+        plan_ms.append((time.perf_counter() - begin) * 1e3 / num_envs)
         if step.skipped.size:
             skipped += live & step.skipped
+        if recorder is not None:
+            recorder.add(env, observation, policy, step)
         result = env.step(safety.filter(step.action))
         policy.advance(result.sent_action)
         rewards += np.where(live, result.reward, 0.0)
         steps += live
         success, terminated, parts = result.success, result.terminated, result.parts
         observation = result.observation
+    if recorder is not None and env.done.all():
+        recorder.write()
     return [
         EpisodeScore(
             episode=scenario.episode,

@@ -16,13 +16,14 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
+from egovcp.packages import require_packages
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config, require_memory_for_robots
 from egovcp.sim.env import resolve_config
-from egovcp.sim.scenario import EPISODE_TASKS, Scenario
-from egovcp.spec import TASKS
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task, select_tasks
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_deploy.controllers import (
@@ -45,20 +46,19 @@ from egovcp_deploy.options import (
     make_output_dir,
     versions,
 )
-from egovcp_deploy.policy import backend_of
+from egovcp_deploy.pilot.planner import backend_of
 from egovcp_deploy.scores import EpisodeScore, success_rate, summary, table
 
 PROG: Final = "egovcp-eval"
 _EPILOG: Final = (
     "All controllers play the same scenarios, which are never used for training data (their seeds "
-    "are offset), each with an event: no empty scenes unless --env.*_episode.empty_probability "
-    "is set. Success: ball blocked by a hand and not hit elsewhere; wall still up and touched "
-    "by hands only; arch passed untouched; sequence: all of its parts, whose rates are listed "
-    "below it. 'constant' is the best fixed action of a grid, found on other scenarios. plan_ms is "
-    "the time per robot when num_envs robots are planned together; --num_envs=1 --num_workers=1 "
-    "gives the latency of one. Writes eval.json (figures), eval_run.json (config and every "
-    "episode) and constant.json. Ctrl-C saves the finished episodes; the result files are marked "
-    "incomplete."
+    "are offset), each with an event: no empty scenes unless --env.*_episode.empty_probability is "
+    "set. `egovcp-task list` describes the tasks; the rates of the parts of a sequence are listed "
+    "below it. 'constant' is the best fixed action of a grid, found on other scenarios. plan_ms "
+    "is the time per robot when num_envs robots are planned together; --num_envs=1 "
+    "--num_workers=1 gives the latency of one. Writes eval.json (figures), eval_run.json (config "
+    "and every episode) and constant.json. Ctrl-C saves the finished episodes; the result files "
+    "are marked incomplete."
 )
 
 type Scores = dict[str, dict[str, list[EpisodeScore]]]
@@ -88,9 +88,9 @@ class EvalConfig:
     """The policy artifact; only for the controller `planner`."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
-    task: str = "ball"
-    """ball, wall, arch, all (these three), or sequence: several in one episode, by default
-    [arch, ball] (--env.sequence.parts)."""
+    task: str = DEFAULT_TASK
+    """One of `egovcp-task list`, package.module:Class, several as ball,wall, or all; sequence plays
+    several in one episode (--env.sequence.parts)."""
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0)
@@ -104,6 +104,9 @@ class EvalConfig:
     """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
+    videos: int = bounded(0, least=0, most=10**6)
+    """Draw the first so many scenarios of each task, with each controller, as GIF, and as MP4 if
+    PyAV is installed (egovcp[video]): rollout-<task>-<controller>-<i>.gif; needs matplotlib."""
     num_envs: int = bounded(8, least=1, most=65_536)
     """Robots that each process plays side by side."""
     num_workers: int = bounded(0, least=0, per_core=MAX_PER_CORE)
@@ -114,7 +117,7 @@ class EvalConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks to play."""
-        return TASKS if self.task == "all" else (self.task,)
+        return select_tasks(self.task)
 
     @property
     def controller_names(self) -> tuple[str, ...]:
@@ -124,7 +127,9 @@ class EvalConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        check_choice("--task", self.task, (*EPISODE_TASKS, "all"))
+        for task in self.tasks:
+            if "oracle" in self.controller_names and not find_task(task).has_oracle():
+                raise UsageError(f"task {task} has no oracle; leave it out of --controllers")
         for name in self.controller_names:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         workers = self.num_workers or available_cores()
@@ -138,6 +143,8 @@ class EvalConfig:
                 "--ppo.path is missing; name the file of egovcp-train-ppo, or leave ppo out of "
                 "--controllers"
             )
+        if self.videos:
+            require_packages("egovcp-deploy", "--videos", "matplotlib")
         check_output_dir(self.output_dir)
 
 
@@ -149,14 +156,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(config: EvalConfig) -> None:
     """Check everything, play, print the table and write the files, also after an error or a signal:
     the finished episodes are saved; the result files are marked incomplete if some are missing.
-
-    Raises:
-        UsageError, DataError, ArtifactError: an option, file or policy cannot be used.
-        EnvironmentFailure: the backend of the planner cannot be used here, or a worker was killed.
-        KeyboardInterrupt: after SIGINT or SIGTERM.
-    """
+    Raises the errors of options, files and policy, `EnvironmentFailure` if a worker was killed, and
+    `KeyboardInterrupt` after SIGINT or SIGTERM."""
     config.check()
-    config = replace(config, env=resolve_config(config.env))
+    config = replace(config, env=resolve_config(config.env, config.tasks))
     controller_id = make_controller(config.env.controller).id
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artifact, ppo, backend = None, None, ""
@@ -183,7 +186,7 @@ def evaluate(config: EvalConfig) -> None:
                 constants = _find_constants(config, pool, constants)
                 found = {task: asdict(best) for task, best in constants.items()}
                 write_json(folder / "constant.json", found)
-            _run_episodes(config, pool, constants, scores)
+            _run_episodes(config, pool, constants, scores, folder)
             if received:
                 raise KeyboardInterrupt
     finally:
@@ -277,10 +280,15 @@ def _find_constants(
 
 
 def _run_episodes(
-    config: EvalConfig, pool: EpisodePool, constants: dict[str, BestConstant], scores: Scores
+    config: EvalConfig,
+    pool: EpisodePool,
+    constants: dict[str, BestConstant],
+    scores: Scores,
+    folder: Path,
 ) -> None:
-    """Play every controller on every task, and add the scores to ``scores``."""
-    groups = list(_groups(config, constants))
+    """Play every controller on every task, and add the scores to ``scores``; videos go to
+    ``folder``."""
+    groups = list(_groups(config, constants, folder))
     total = sum(len(group.scenarios) for group in groups)
     with tqdm(total=total, unit="ep", desc="evaluate") as bar:
         for i, part in pool.play(groups):
@@ -294,14 +302,18 @@ def _run_episodes(
             bar.update(len(part))
 
 
-def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterator[EpisodeGroup]:
+def _groups(
+    config: EvalConfig, constants: dict[str, BestConstant], folder: Path
+) -> Iterator[EpisodeGroup]:
     """The planner's groups first, since they take longest."""
     for name in sorted(config.controller_names, key=lambda name: name != PLANNER):
         for task in config.tasks:
             scenarios = [held_out(task, config.seed, i) for i in range(config.episodes)]
             for part in batched(scenarios, config.num_envs):
                 action = constants[task].action if name == CONSTANT else ()
-                yield EpisodeGroup(name, part, action)
+                stems = [folder / f"rollout-{task}-{name}-{s.episode}" for s in part]
+                videos = tuple(stems[: max(0, config.videos - part[0].episode)])
+                yield EpisodeGroup(name, part, action, videos)
 
 
 def _score_json(score: EpisodeScore) -> dict[str, Any]:

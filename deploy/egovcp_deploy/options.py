@@ -15,6 +15,7 @@ import draccus
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
+from egovcp.packages import is_installed
 from egovcp.sim.scenario import Scenario
 
 PLANNER: Final = "planner"
@@ -52,12 +53,8 @@ def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
 
 
 def check_output_dir(path: str) -> Path:
-    """The folder of ``--output_dir``, which must be new or empty; it is not created.
-
-    Raises:
-        UsageError: no folder is named, or it holds files.
-        EnvironmentFailure: it cannot be created or written to.
-    """
+    """The folder of ``--output_dir``, which must be new or empty; it is not created. Raises
+    `UsageError` if none is named or it holds files, `EnvironmentFailure` if it is not writable."""
     if not path:
         raise UsageError("--output_dir is missing; name a new folder for the results")
     folder = Path(os.path.expanduser(path))
@@ -83,15 +80,23 @@ def make_output_dir(path: str) -> Path:
     return folder
 
 
+def video_paths(stem: Path) -> list[Path]:
+    """``stem`` as GIF, and as MP4 if PyAV is installed."""
+    suffixes = [".gif", *([".mp4"] if is_installed("av") else [])]
+    return [stem.with_suffix(suffix) for suffix in suffixes]
+
+
 def encoded(config: object, *paths: str) -> dict[str, Any]:
     """The options as JSON values; local paths in the options ``paths`` become absolute, so that
     they are valid in any working directory."""
+    from egovcp.artifact import shipped_policies  # imports torch
+
     options: dict[str, Any] = draccus.encode(config)
     for option in paths:
         *sections, name = option.split(".")
         section = reduce(getitem, sections, options)
         path = section[name]
-        if path and is_local_path(path):
+        if path and is_local_path(path) and path not in shipped_policies():
             section[name] = os.path.abspath(os.path.expanduser(path))
     return options
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
-from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
 from egovcp.log.tick import CameraView, RunInfo
-from egovcp.log.viewer import LiveRerun
 from egovcp.packages import is_installed
 from egovcp.terminal import echo
-from egovcp_deploy.options import versions
+from egovcp_deploy.options import versions, video_paths
 
 if TYPE_CHECKING:
     from egovcp_deploy.config import DeployConfig
@@ -42,18 +42,18 @@ class LogOptions:
 def recording(
     folder: Path, episode: int, info: RunInfo, options: LogOptions, blocking: bool
 ) -> Iterator[Sink]:
-    """Sinks of rollout number ``episode``.
-
-    If ``blocking``, the loop may wait for the disk, as in simulated time; else each sink runs in a
-    separate process. A viewer always does: it may die or hang.
-    """
+    """Sinks of rollout number ``episode``. If ``blocking``, the loop may wait for the disk, as in
+    simulated time; else each sink, like any viewer, runs in a separate process."""
     with ExitStack() as stack:
         files = _file_sinks(folder / f"rollout-{episode}", episode, options)
         viewers = list[AsyncSink]()
         if options.live:
+            from egovcp.log.rerun import RerunSink  # takes half a second
+            from egovcp.log.viewer import LiveRerun
+
             live = stack.enter_context(LiveRerun.of(options.live))
             if live.page:
-                echo(f"look at it: {live.page}")
+                echo(f"Rerun viewer: {live.page}")
             viewers.append(AsyncSink(RerunSink(live.viewer), "Rerun"))
         sink: Sink
         if blocking:
@@ -67,7 +67,7 @@ def recording(
 
 
 def missing_ticks(sink: Sink) -> dict[str, int]:
-    """Log -> ticks that it lacks or may lack, of a closed `recording` that was not blocking."""
+    """Log -> how many steps may be missing in it, of a closed `recording` that was not blocking."""
     sinks = sink.sinks if isinstance(sink, AsyncFanout) else ()
     return {each.name: each.dropped + each.lost for each in sinks}
 
@@ -77,13 +77,13 @@ def _file_sinks(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink
     mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
     sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
+        from egovcp.log.rerun import RerunSink
+
         sinks[rrd.name] = RerunSink(rrd)
     if episode < options.videos and is_installed("matplotlib"):
         from egovcp.log.picture import PictureSink
 
-        suffixes = [".png", ".gif", *([".mp4"] if is_installed("av") else [])]
-        drawings = [stem.with_suffix(suffix) for suffix in suffixes]
-        sinks[f"{stem.name}.gif"] = PictureSink(*drawings)
+        sinks[f"{stem.name}.gif"] = PictureSink(stem.with_suffix(".png"), *video_paths(stem))
     return sinks
 
 
@@ -107,6 +107,12 @@ def run_info(
         versions=versions(),
         backend=backend,
     )
+
+
+def percentiles(name: str, values: list[float]) -> dict[str, float]:
+    """Median and 99th percentile, for ``deploy.json``."""
+    p50, p99 = np.percentile(values or [0.0], [50, 99])
+    return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
 def provenance(

@@ -8,7 +8,7 @@ With o_{t+1} the planner receives the action that was sent, and advances its rec
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -32,13 +32,14 @@ from egovcp_deploy.pilot.planner import (
     PlanMessage,
     PlannerClient,
     PlannerRunner,
+    RolloutPolicy,
+    backend_of,
     planner_fields,
 )
 from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State
-from egovcp_deploy.policy import RolloutPolicy, backend_of
-from egovcp_deploy.recording import provenance, recording, run_info
-from egovcp_deploy.robots import LockstepRobot, RobotObservation
-from egovcp_deploy.robots.replay import open_recordings
+from egovcp_deploy.recording import percentiles, provenance, recording, run_info
+from egovcp_deploy.robots.base import RobotObservation
+from egovcp_deploy.robots.replay import ReplayRobot, open_recordings
 
 if TYPE_CHECKING:
     from egovcp_deploy.robots.sim import SimRobot
@@ -53,16 +54,17 @@ class RolloutSummary:
     steps: int = 0
     reward: float = 0.0  # sum over the rollout
     success: bool = False
+    parts: Mapping[str, bool] = field(default_factory=dict)  # success of each part of a sequence
     terminated: bool = False
     truncated: bool = False
     rejected: int = 0  # plans that were not finite and were not used
     skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
-    held: int = 0  # ticks in HOLD
+    held: int = 0  # steps in HOLD
     damped: str = ""  # why the motors were damped; empty: they were not
     plan_ms: list[float] = field(default_factory=list)  # time to filter and plan, per plan
 
     def add(self, tick: Tick) -> None:
-        """Count one more tick."""
+        """Add one step."""
         self.steps += 1
         self.reward += tick.reward
         self.success = tick.success
@@ -76,15 +78,15 @@ class RolloutSummary:
 
 class LockstepRunner:
     """Drives one robot with one planner on the same simulated ``clock``, until the robot ends the
-    rollout. ``operator`` maps each tick to a request."""
+    rollout. ``operator`` maps the index of a step to a request."""
 
     def __init__(
         self,
         planner: PlannerClient,
-        robot: LockstepRobot,
+        robot: SimRobot | ReplayRobot,
         clock: LockstepClock,
         limits: Limits | None = None,
-        operator: Callable[[int], OperatorRequest | None] = lambda tick: None,
+        operator: Callable[[int], OperatorRequest | None] = lambda index: None,
     ) -> None:
         self._planner, self._limits = planner, limits
         self._robot = robot
@@ -101,6 +103,7 @@ class LockstepRunner:
             tick = self._tick(summary.steps)
             sink.write(tick)
             summary.add(tick)
+            summary.parts = self._parts
             on_tick(tick)
             self._clock.advance(_PERIOD_NS)
         if self._pilot.supervisor.state is State.DAMP:
@@ -115,7 +118,7 @@ class LockstepRunner:
         planned = time.perf_counter()
         wanted = self._pilot.next_action()
         outcome = self._robot.act(wanted)
-        self._pilot.sent = outcome.sent
+        self._pilot.sent, self._parts = outcome.sent, outcome.parts
         ended = time.perf_counter()
         timing = {
             "observe": observed - begin,
@@ -146,7 +149,7 @@ class LockstepRunner:
         )
 
     def _plan(self, index: int, sensed: RobotObservation) -> PlanMessage | None:
-        """Update the state machine and plan; None: no plan within the tick."""
+        """Update the state machine and plan; None: no plan within the step."""
         pilot, now = self._pilot, self._clock.now_ns()
         pilot.sense(now, sensed.state, sensed.depth)
         before = pilot.supervisor.state
@@ -160,9 +163,9 @@ class LockstepRunner:
         return pilot.receive_plans(now + _PERIOD_NS)
 
 
-def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> None:
+def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
     """Play and record rollouts of the simulated robot; complete ones are summarised in any case.
-    Raises as `deploy`."""
+    Returns the output folder. Raises as `deploy`."""
     robot = make_robot(config)
     try:
         config = replace(config, env=robot.env.config)  # as resolved for its controller
@@ -176,18 +179,18 @@ def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> None:
         else:
             artifact.require_controller(robot.controller_id)
             policy = artifact.make_policy(1, config.seed)
-        _play(config, artifact, robot, policy)
+        return _play(config, artifact, robot, policy)
     finally:
         robot.close()
 
 
-def replay(config: DeployConfig, artifact: Artifact) -> None:
-    """Plan again on recorded observations, of at most ``episodes`` recordings. Raises as `deploy`,
-    and `DataError` if a recording is damaged."""
+def replay(config: DeployConfig, artifact: Artifact) -> Path:
+    """Plan again on recorded observations, of at most ``episodes`` recordings. Returns the output
+    folder. Raises as `deploy`, and `DataError` if a recording is damaged."""
     robot = open_recordings(Path(config.robot.recordings))
     artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, robot.count))
-    _play(config, artifact, robot, artifact.make_policy(1, config.seed))
+    return _play(config, artifact, robot, artifact.make_policy(1, config.seed))
 
 
 def make_robot(config: DeployConfig) -> SimRobot:
@@ -198,8 +201,11 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 
 def _play(
-    config: DeployConfig, artifact: Artifact | None, robot: LockstepRobot, policy: RolloutPolicy
-) -> None:
+    config: DeployConfig,
+    artifact: Artifact | None,
+    robot: SimRobot | ReplayRobot,
+    policy: RolloutPolicy,
+) -> Path:
     planner = PlannerRunner(policy, config.imagine)
     if artifact is not None:
         planner.warm_up()
@@ -227,41 +233,42 @@ def _play(
                 **provenance(config, robot.controller_id, artifact, backend),
             }
             write_json(folder / "deploy.json", report)
-            _print(summaries, folder)
+            _print(summaries)
+    return folder
 
 
 def _show(bar: Any, tick: Tick) -> None:
     plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
-    bar.set_postfix_str(f"tick {tick.index}, {tick.mode}{plan}", refresh=False)
+    bar.set_postfix_str(f"step {tick.index}, {tick.mode}{plan}", refresh=False)
     bar.update(0)
 
 
 def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
-    p50, p99 = np.percentile(summary.plan_ms or [0.0], [50, 99])
     return {
         "episode": episode,
         "steps": summary.steps,
         "reward_mean": summary.reward / summary.steps,
         "success": summary.success,
+        **({"parts": dict(summary.parts)} if summary.parts else {}),
         "terminated": summary.terminated,
         "rejected_plans": summary.rejected,
         "skipped_observations": summary.skipped,
         "held_ticks": summary.held,
         "damped": summary.damped,
-        "plan_ms_p50": float(p50),
-        "plan_ms_p99": float(p99),
+        **percentiles("plan_ms", summary.plan_ms),
         "mcap": f"rollout-{episode}.mcap",
         "rrd": f"rollout-{episode}.rrd",
     }
 
 
-def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
+def _print(summaries: Sequence[RolloutSummary]) -> None:
     for i, summary in enumerate(summaries):
         verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
         echo(
-            f"rollout {i}: {verdict}, {summary.steps} ticks, "
+            f"rollout {i}: {verdict}, {summary.steps} steps, "
             f"mean reward {summary.reward / summary.steps:+.4f}, "
             f"plan {np.median(summary.plan_ms):.0f} ms"
             + (f", {summary.skipped} observations skipped" if summary.skipped else "")
         )
-    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+        for name, success in summary.parts.items():
+            echo(f"  {name}: {'success' if success else 'failure'}")

@@ -23,12 +23,12 @@ class EpisodeScore:
     """One episode, played by one controller."""
 
     episode: int  # index of the scenario
-    steps: int  # planner ticks until the time limit or the fall
+    steps: int  # until the time limit or the fall
     reward: float  # sum over the episode
     success: bool
     terminated: bool
     plan_ms: list[float] = field(default_factory=list)
-    """Time per tick to decide on one action, ms; shared by robots planned together."""
+    """Time per step to compute an action, ms; for robots planned together, per robot."""
     skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
     parts: dict[str, bool] = field(default_factory=dict)
     """Success of each part of a sequence of tasks; empty for a single task."""
@@ -109,11 +109,8 @@ def _successes(successes: Sequence[bool]) -> dict[str, Any]:
 
 
 def summary(scores: ScoreTable, requested: int) -> dict[str, dict[str, dict[str, Any]]]:
-    """``{task: {controller: figures}}``, the content of ``eval.json``.
-
-    Figures of fewer than ``requested`` episodes also hold ``incomplete`` (true) and
-    ``episodes_requested``.
-    """
+    """``{task: {controller: figures}}``, the content of ``eval.json``. Figures of fewer than
+    ``requested`` episodes also hold ``incomplete`` (true) and ``episodes_requested``."""
     missing = {"incomplete": True, "episodes_requested": requested}
     return {
         task: {

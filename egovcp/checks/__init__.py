@@ -1,9 +1,4 @@
-"""Public conformance checks of datasets, environments, world models and policies.
-
-    check_world_model(model)     recurrence, reset, batching and shapes of a world model
-    check_artifact(path)         a policy artifact loads, conforms and plans
-    check_env(env, scenarios)    clock, reset, repeatability and limits of an environment
-    check_dataset(config)        every episode is readable, and its commands agree with its actions
+"""Public conformance checks of datasets, environments, tasks, world models and policies.
 
 Each raises an `EgovcpError` that names the problem and its place.
 """
@@ -18,21 +13,26 @@ from egovcp.errors import ConformanceError
 if TYPE_CHECKING:
     from egovcp.checks.dataset import check_dataset
     from egovcp.checks.environment import check_env
+    from egovcp.checks.task import TaskReport, check_task
     from egovcp.checks.world_model import check_artifact, check_world_model
 
 __all__ = [
     "ConformanceError",
+    "TaskReport",
     "check_artifact",
     "check_dataset",
     "check_env",
+    "check_task",
     "check_world_model",
 ]
 
 #: Imported on first use: a check of a dataset does not import torch.
 _MODULES = {
+    "TaskReport": "task",
     "check_artifact": "world_model",
     "check_dataset": "dataset",
     "check_env": "environment",
+    "check_task": "task",
     "check_world_model": "world_model",
 }
 

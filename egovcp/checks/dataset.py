@@ -2,53 +2,53 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
-from egovcp.checks.statistics import EpisodeStatistics, StatisticsCheck
+from egovcp.checks.feature_statistics import numbers_in
+from egovcp.checks.lerobot_dataset import STALE, Progress, lerobot_problems, split_problems
 from egovcp.cli import DatasetConfig
-from egovcp.data import DatasetReader, Episode, metadata, schema
+from egovcp.data import DatasetReader, Episode, metadata, schema, stats
+from egovcp.data.lerobot import is_own
 from egovcp.data.metadata import hash_problems
-from egovcp.data.parquet import data_errors, open_parquet
+from egovcp.data.parquet import EPISODE_FEATURES, data_errors, open_parquet
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.provenance import DuplicateFinder
 from egovcp.data.source import Source, locate
 from egovcp.errors import DataError
 
-type Progress = Callable[[int, int], None]
-
-_RANGE = re.compile(r"(\d{1,18}):(\d{1,18})", re.ASCII)
+_RELATIVE = 1e-4  # of the column's range: statistics may be float32
+_ABSOLUTE = 1e-6
 
 
 def check_dataset(config: DatasetConfig, progress: Progress | None = None) -> None:
-    """Check every file and every frame of a dataset; see `dataset_problems`.
+    """Check every file and frame of a dataset; raises the first of its `dataset_problems`.
 
-    Args:
-        config: the dataset.
-        progress: called with (episodes done, episodes in all).
-
-    Raises:
-        UsageError: the configuration names no dataset.
-        DataError: the first problem.
-        EnvironmentFailure: the Hub cannot be reached.
+    ``progress`` is called with the number of episodes done, and of all.
     """
     for error in dataset_problems(locate(config).root, progress):
         raise error
 
 
-def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[DataError]:
+def dataset_problems(
+    root: Path, progress: Progress | None = None, notes: list[str] | None = None
+) -> Iterator[DataError]:
     """All problems of the dataset in the folder ``root``, without network access.
 
-    Checked in this order: the files (recorded hashes, no additional files), the `meta` folder, each
-    episode (schema, counts, times, values, recorded digest, commands that agree with the actions,
-    no duplicate), and the statistics.
+    A dataset of another origin (see `is_own`) is checked by `lerobot_problems`, which appends what
+    it does not check to ``notes``. One of egovcp's is checked in this order: the files (recorded
+    hashes, no additional files), the `meta` folder, each episode (schema, counts, times, values,
+    recorded digest, commands that agree with the actions, no duplicate), and the statistics.
     """
+    if not is_own(root):
+        yield from lerobot_problems(root, progress, notes)
+        return
     yield from _raised(hash_problems(root))
     reader = yield from _open(root)
     if reader is None:
@@ -80,8 +80,7 @@ def _open(root: Path) -> Generator[DataError, None, DatasetReader | None]:
     except DataError as error:
         first = error
     yield first
-    loaders = (metadata.load_info, metadata.load_tasks, metadata.load_stats)
-    for load in loaders:
+    for load in (metadata.load_info, metadata.load_tasks, metadata.load_stats):
         try:
             load(root)
         except DataError as error:
@@ -163,7 +162,7 @@ def _table_problems(reader: DatasetReader) -> Iterator[DataError]:
     if info.get("total_tasks") != len(reader.task_names):
         found = f"total_tasks is {info.get('total_tasks')}"
         yield DataError.at(path, f"{found}, but {schema.TASKS_PATH} lists {len(reader.task_names)}")
-    yield from (DataError.at(path, text) for text in _split_problems(info, len(reader)))
+    yield from (DataError.at(path, text) for text in split_problems(info, len(reader)))
     index = 0
     for file in metadata.episode_files(reader.root):
         with data_errors(file):
@@ -175,12 +174,100 @@ def _table_problems(reader: DatasetReader) -> Iterator[DataError]:
             index += 1
 
 
-def _split_problems(info: dict[str, Any] | Any, episodes: int) -> Iterator[str]:
-    splits = info.get("splits")
-    if not isinstance(splits, dict) or not splits:
-        yield f"splits is {splits!r}, expected ranges of episodes such as {{'train': '0:9'}}"
-        return
-    for name, text in splits.items():
-        found = _RANGE.fullmatch(text) if isinstance(text, str) else None
-        if found is None or not int(found[1]) <= int(found[2]) <= episodes:
-            yield f"split {name} is {text!r}, expected a range within 0:{episodes}"
+class StatisticsCheck:
+    """Compares ``meta/stats.json`` with the statistics of all frames."""
+
+    def __init__(self, reader: DatasetReader) -> None:
+        self._reader = reader
+        self._frames = 0
+        self._total: stats.Matrix | None = None
+
+    def add(self, episode: Episode) -> stats.Matrix:
+        """Add a valid episode; returns the statistics (R, D) of its frames."""
+        matrix = _statistics(self._reader, episode)
+        parts = [matrix] if self._total is None else [self._total, matrix]
+        counts = [len(episode)] if self._total is None else [self._frames, len(episode)]
+        self._total = stats.aggregate(parts, counts)
+        self._frames += len(episode)
+        return matrix
+
+    def problems(self) -> Iterator[DataError]:
+        """Differences from ``meta/stats.json``, if all frames of the dataset were added."""
+        path = self._reader.root / schema.STATS_PATH
+        found = self._reader.stats
+        for key in self._reader.features:
+            if not isinstance(found.get(key), dict):
+                yield DataError.at(path, f"has no statistics of {key}")
+        if self._total is None or self._frames != self._reader.num_frames:
+            return
+        for key in _checked(self._reader):
+            if isinstance(found.get(key), dict):
+                for problem in _differences(found[key], self._total, key, self._frames):
+                    yield DataError.at(path, f"{key}: {problem}")
+
+
+class EpisodeStatistics:
+    """Compares the statistics in ``meta/episodes`` with the frames, file by file."""
+
+    def __init__(self, reader: DatasetReader) -> None:
+        self._reader = reader
+        self._rows = self._all_rows()
+
+    def problems(self, index: int, matrix: stats.Matrix | None) -> Iterator[DataError]:
+        """Differences from the table's row of an episode; call it for every episode in order.
+
+        ``matrix`` are the statistics (R, D) of its frames; None: unknown.
+        """
+        found_row = next(self._rows, None)
+        if found_row is None or matrix is None:
+            return
+        path, row = found_row
+        for key in _checked(self._reader):
+            prefix = f"stats/{key}/"
+            found = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
+            length = int(self._reader.lengths[index])
+            for problem in _differences(found, matrix, key, length):
+                yield DataError.at(path, f"statistics of {key}: {problem}", index)
+
+    def _all_rows(self) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+        for path in metadata.episode_files(self._reader.root):
+            with data_errors(path):
+                file = open_parquet(path)
+                names = [n for n in file.schema_arrow.names if n.startswith("stats/")]
+                for group in range(file.num_row_groups):
+                    for row in file.read_row_group(group, columns=names).to_pylist():
+                        yield path, row
+
+
+def _checked(reader: DatasetReader) -> Iterator[str]:
+    """The features whose statistics are compared."""
+    return (key for key in reader.features if key not in STALE)
+
+
+def _statistics(reader: DatasetReader, episode: Episode) -> stats.Matrix:
+    columns = {key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()}
+    depth = columns.pop(spec.DEPTH_KEY)
+    frames = np.arange(len(episode), dtype=np.int64)
+    places: dict[str, NDArray[np.generic]] = {
+        **dict.fromkeys(schema.INDEX_FEATURES, frames),  # those in STALE are not compared
+        "timestamp": (frames / reader.fps).astype(np.float32),
+    }
+    return np.concatenate([stats.data_stats(depth, columns), stats.index_stats(places)], axis=1)
+
+
+def _differences(
+    found: Mapping[str, object], matrix: stats.Matrix, key: str, frames: int
+) -> Iterator[str]:
+    part = matrix[:, stats.LAYOUT[key]]
+    least, most, mean = part[0], part[1], part[2]
+    slack = _RELATIVE * (most - least + np.abs(mean)) + _ABSOLUTE
+    for name, expected in zip(stats.ROWS, part, strict=True):
+        values = numbers_in(found.get(name))
+        if values is None or values.shape != expected.shape:
+            yield f"{name} is missing or has not {len(expected)} numbers"
+        elif not (np.abs(values - expected) <= slack).all():
+            at = int(np.argmax(~(np.abs(values - expected) <= slack)))
+            yield f"{name} of value {at} is {values[at]:.6g}, its frames have {expected[at]:.6g}"
+    count = found.get("count")
+    if count != [frames] or not isinstance(count, list) or isinstance(count[0], bool):
+        yield f"count is {count!r:.80}, expected [{frames}]"

@@ -63,12 +63,8 @@ def check_env[S, O: _Observation](
 ) -> None:
     """Run the scenarios twice under the same random actions and check every tick.
 
-    Args:
-        scenarios: one per row of the environment.
-        ticks: planner ticks per run; the actions exceed the rate limit.
-
-    Raises:
-        ConformanceError: a check failed; the message names the tick and the property.
+    ``scenarios`` has one per row of the environment; the actions exceed the rate limit. Raises
+    `ConformanceError`, which names the tick and the property.
     """
     rng = np.random.default_rng(seed)
     actions = rng.uniform(-1, 1, (ticks, env.num_envs, spec.ACTION_DIM))
@@ -105,60 +101,45 @@ def _arrays(observation: _Observation) -> dict[str, NDArray[np.generic]]:
 
 
 def _check_observation(observation: _Observation, sent: Array, t: int) -> None:
-    rows = len(sent)
+    depth, state, rows = observation.depth, observation.state, len(sent)
     layout: dict[str, tuple[NDArray[Any], tuple[int, ...], type[np.generic]]] = {
-        "depth": (observation.depth, (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
-        "state": (observation.state, (rows, spec.STATE_DIM), np.float32),
+        "depth": (depth, (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
+        "state": (state, (rows, spec.STATE_DIM), np.float32),
     }
     for name, (array, shape, dtype) in layout.items():
-        _require(
-            array.shape == shape and array.dtype == dtype,
-            t,
-            f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}",
-        )
-    _require(bool(np.isfinite(observation.state).all()), t, "state is not finite")
-    _require(
-        bool((observation.depth <= 1000 * spec.DEPTH_MAX_M).all()),
-        t,
-        f"depth exceeds {spec.DEPTH_MAX_M} m",
-    )
-    command_error = np.abs(
-        command_from_state(observation.state) - spec.ACTION_BOX.to_metric(sent)
-    ).max()
-    _require(
-        bool(command_error <= COMMAND_TOLERANCE),
-        t,
-        f"the command in the state is not the last one sent (off by {command_error:.3g} m)",
-    )
+        found, expected = f"{array.dtype} {array.shape}", f"{np.dtype(dtype)} {shape}"
+        _require(found == expected, t, f"{name} is {found}, expected {expected}")
+    _require(np.isfinite(state).all(), t, "state is not finite")
+    near = depth <= 1000 * spec.DEPTH_MAX_M
+    _require(near.all(), t, f"depth exceeds {spec.DEPTH_MAX_M} m")
+    off = np.abs(command_from_state(state) - spec.ACTION_BOX.to_metric(sent)).max()
+    problem = f"the command in the state is not the last one sent (off by {off:.3g} m)"
+    _require(off <= COMMAND_TOLERANCE, t, problem)
 
 
 def _check_sent(sent: Array, before: Array, t: int) -> None:
-    change = np.abs(sent - before).max()
-    limit = spec.ACTION_RATE_LIMIT
+    change, limit = np.abs(sent - before).max(), spec.ACTION_RATE_LIMIT
     _require(
-        bool(change <= limit + 1e-6),
+        change <= limit + 1e-6,
         t,
         f"the action sent changed by {change:.3g} (normalised units) in one tick, the rate limit "
         f"is {limit}",
     )
-    _require(bool(np.abs(sent).max() <= 1 + 1e-6), t, "the action sent leaves [-1, 1]")
+    _require(np.abs(sent).max() <= 1 + 1e-6, t, "the action sent leaves [-1, 1]")
 
 
 def _check_step[O: _Observation](step: _Step[O], finished: NDArray[np.bool_], t: int) -> None:
     terms = np.sum(list(step.reward_terms.values()), axis=0)
-    _require(bool(np.isfinite(step.reward).all()), t, "reward is not finite")
-    _require(np.allclose(terms, step.reward), t, "reward is not the sum of its terms")
+    done = step.terminated | step.truncated
     both = step.terminated & step.truncated
+    _require(np.isfinite(step.reward).all(), t, "reward is not finite")
+    _require(np.allclose(terms, step.reward), t, "reward is not the sum of its terms")
     _require(not both.any(), t, "a row is terminated and truncated at once")
-    _require(
-        bool((step.terminated | step.truncated)[finished].all()),
-        t,
-        "an episode continues after its end",
-    )
+    _require(done[finished].all(), t, "an episode continues after its end")
     _require(not np.any(step.reward[finished]), t, "reward after the end of an episode")
 
 
-def _require(ok: bool, t: int, problem: str) -> None:
+def _require(ok: bool | np.bool_, t: int, problem: str) -> None:
     if not ok:
         raise ConformanceError(f"environment, tick {t}: {problem}")
 

@@ -82,76 +82,61 @@ def check_world_model(model: RecurrentModel, seed: int = 0) -> None:
     _check_decoder(model, later)
 
 
+def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
+    """Each row of a batch gives the same result alone."""
+    continues = torch.zeros(1, dtype=torch.bool)
+    for b in range(len(inputs.action)):
+        row = slice(b, b + 1)
+        observed = inputs.action[row], inputs.depth[row], inputs.state[row], continues
+        alone = model.observe(_row(start, row), *observed)
+        problem = "observe lets the rows of a batch influence each other"
+        _same(problem, _row(batched, row), alone)
+
+
 def _row(carry: Carry, row: slice) -> Carry:
     return carry.map(lambda x: x[row])
 
 
-def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
-    """Each row of a batch gives the same result alone."""
-    going_on = torch.zeros(1, dtype=torch.bool)
-    for b in range(len(inputs.action)):
-        row = slice(b, b + 1)
-        alone = model.observe(
-            _row(start, row),
-            inputs.action[row],
-            inputs.depth[row],
-            inputs.state[row],
-            going_on,
-        )
-        expected = _row(batched, row)
-        _same("observe lets the rows of a batch influence each other", expected, alone)
-
-
 def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
     """imagine, value and termination broadcast (E, 1, ...) states over (E, M, 7) actions."""
-    robots, many = plans.shape[:2]
     shared = model.expand_candidates(carry)
     before = copy.deepcopy(shared)
     ahead = model.imagine(shared, plans)
     _same("imagine changes its input carry", before, shared)
     _finite("imagine", ahead)
-    heads: dict[str, Tensor] = {
+    termination = model.termination(ahead)
+    heads = {
         "value": model.value(shared, plans),
         "value of imagined states": model.value(ahead, plans),
-        "termination of imagined states": model.termination(ahead),
+        "termination of imagined states": termination,
     }
     for name, answer in heads.items():
-        _require(
-            answer.shape == (robots, many),
-            f"{name} has shape {tuple(answer.shape)}, expected {(robots, many)}",
-        )
-        _require(bool(answer.isfinite().all()), f"{name} is not finite")
-    dead = heads["termination of imagined states"]
-    _require(bool(((dead >= 0) & (dead <= 1)).all()), "termination is not a probability")
-    _require(bool(torch.as_tensor(model.min_return).isfinite().all()), "min_return is not finite")
-    alone = model.imagine(carry, plans[:, 0])
-    _same(
-        "imagine lets the candidates influence each other",
-        ahead.map(lambda x: x[:, 0]),
-        alone,
-    )
+        found, expected = tuple(answer.shape), tuple(plans.shape[:2])
+        _require(found == expected, f"{name} has shape {found}, expected {expected}")
+        _require(answer.isfinite().all(), f"{name} is not finite")
+    is_probability = ((termination >= 0) & (termination <= 1)).all()
+    _require(is_probability, "termination is not a probability")
+    _require(torch.as_tensor(model.min_return).isfinite().all(), "min_return is not finite")
+    alone, first = model.imagine(carry, plans[:, 0]), ahead.map(lambda x: x[:, 0])
+    _same("imagine lets the candidates influence each other", first, alone)
 
 
 def _check_decoder(model: RecurrentModel, carry: Carry) -> None:
     depth, state = model.decode(carry)
-    rows = len(carry.h)
-    _require(
-        depth.shape == (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-        and state.shape == (rows, spec.STATE_DIM),
-        f"decode gives {tuple(depth.shape)} and {tuple(state.shape)}",
-    )
-    _require(bool(depth.isfinite().all() and state.isfinite().all()), "decode is not finite")
-    _require(bool((depth >= 0).all()), "decode gives negative depth")
+    found, rows = (tuple(depth.shape), tuple(state.shape)), len(carry.h)
+    expected = (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), (rows, spec.STATE_DIM)
+    _require(found == expected, f"decode gives {found[0]} and {found[1]}")
+    _require(depth.isfinite().all() and state.isfinite().all(), "decode is not finite")
+    _require((depth >= 0).all(), "decode gives negative depth")
 
 
-def _require(ok: bool, problem: str) -> None:
+def _require(ok: bool | Tensor, problem: str) -> None:
     if not ok:
         raise ConformanceError(f"world model: {problem}")
 
 
 def _finite(name: str, carry: Carry) -> None:
-    finite = all(part.isfinite().all() for part in carry)
-    _require(finite, f"{name} is not finite")
+    _require(all(part.isfinite().all() for part in carry), f"{name} is not finite")
 
 
 def _same(problem: str, expected: Carry, found: Carry) -> None:
@@ -161,24 +146,15 @@ def _same(problem: str, expected: Carry, found: Carry) -> None:
 
 
 def check_artifact(path: str, revision: str = "") -> Artifact:
-    """Load an artifact, check its model, and let it plan once.
-
-    Raises:
-        ArtifactError: it does not load, does not conform, or does not plan.
-        EnvironmentFailure: the Hub cannot be reached.
-    """
+    """Load an artifact, check its model, and let it plan once; raises `ArtifactError`."""
     artifact = load_artifact(path, revision)
     inputs = RandomInputs(1, seed=0)
     try:
         check_world_model(artifact.world_model)
     except ConformanceError as error:
         raise ArtifactError(f"{artifact.path}: {error}; train again") from error
-    steps = [
-        artifact.make_policy(seed=0).act(
-            inputs.depth.numpy().astype(np.uint16), inputs.state.numpy()
-        )
-        for _ in range(2)
-    ]
+    depth, state = inputs.depth.numpy().astype(np.uint16), inputs.state.numpy()
+    steps = [artifact.make_policy(seed=0).act(depth, state) for _ in range(2)]
     plan = steps[0].plan
     if not (np.isfinite(plan).all() and np.abs(plan).max() <= 1 and np.isfinite(steps[0].value)):
         raise ArtifactError(f"{artifact.path}: its plan is not finite or leaves [-1, 1]")

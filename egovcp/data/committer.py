@@ -17,12 +17,11 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-import pyarrow as pa
-
+from egovcp import spec
 from egovcp.data import files, metadata, schema, stats
 from egovcp.data.destination import (
     is_vacant,
@@ -102,10 +101,6 @@ class Committer:
 
         On return they are in the dataset, flushed to the disk. On failure the dataset is unchanged
         and no staged episode is lost.
-
-        Raises:
-            OSError: the disk is full or broken.
-            DataError: the dataset has been removed or changed.
         """
         numbers = list(range(self.next_number, self.next_number + self.ready()))
         episodes: list[EncodedEpisode] = []
@@ -145,7 +140,6 @@ class Committer:
         return work_folder(self.root) / "next"
 
     def _load(self, check: CheckProvenance) -> None:
-        """Load the dataset and the staged episodes of an earlier run."""
         recover(self._next, self.root)
         shutil.rmtree(self._next, ignore_errors=True)
         run = work_folder(self.root) / "run.json"
@@ -184,12 +178,6 @@ def open_committer(
         shard_episodes: episodes per shard of a new dataset; an existing one keeps its value.
         resume: called with the provenance of an existing dataset or unfinished collection; it
             raises if that cannot be continued. None: there must be none.
-
-    Raises:
-        UsageError: ``root`` exists and ``resume`` is None, or ``root`` cannot exist.
-        EnvironmentFailure: another process holds the lock, or ``root`` is not writable or a mount
-            point.
-        DataError: the existing dataset is damaged.
     """
     root = resolve_root(root)
     make_parent(root)
@@ -225,31 +213,36 @@ def _require_unused(root: Path, work: Path) -> None:
         )
 
 
-@dataclass(frozen=True)
-class AppendState:
+class AppendState(NamedTuple):
     """What is needed to append to a dataset."""
 
-    contents: VersionContents
-    """Content of the complete shards."""
-    tail: list[EncodedEpisode]
-    """Episodes of the last shard if it is not complete."""
+    contents: VersionContents  # of the complete shards
+    tail: list[EncodedEpisode]  # episodes of the last shard if it is not complete
     provenance: Provenance
-    next_number: int
-    """Number, in the collection, of the next episode; more than the number of episodes if some
-    were removed."""
+    next_number: int  # of the collection
 
 
 def load_append_state(root: Path) -> AppendState:
     """Verify a dataset and read what is needed to append to it."""
     verify_hashes(root)
     reader, hashes = DatasetReader(Source(root, "")), load_hashes(root)
+    if missing := [key for key in spec.OPTIONAL_KEYS if key not in reader.features]:
+        raise DataError(
+            f"{root} was written by an earlier version, without {', '.join(missing)}, and cannot "
+            "be extended; collect into another folder, then join the two with `egovcp-dataset "
+            "merge`"
+        )
     episodes, size = len(reader), reader.provenance.get("shard_episodes")
     if not isinstance(size, int) or size < 1 or not hashes:
         raise DataError(
             f"{root} was not written in shards by egovcp and cannot be extended; "
             "`egovcp-dataset repair` writes a copy that can"
         )
-    shards = [_episodes_table(root, number) for number in range(-(-episodes // size))]
+    shards = []
+    for number in range(-(-episodes // size)):
+        path = root / shard_paths(number)[1]
+        with data_errors(path):
+            shards.append(open_parquet(path).read())
     matrices = [stats.from_arrow(shard) for shard in shards]
     lengths = [shard["length"].to_pylist() for shard in shards]
     full = episodes // size
@@ -289,12 +282,6 @@ def _next_number(reader: DatasetReader) -> int:
             problem = f"is number {number} of the collection, as episode {first[number]}"
             raise DataError.at(path, f"{problem}; `egovcp-dataset repair` keeps one", index)
     return max(first, default=-1) + 1
-
-
-def _episodes_table(root: Path, number: int) -> pa.Table:
-    path = root / shard_paths(number)[1]
-    with data_errors(path):
-        return open_parquet(path).read()
 
 
 def _read_tail(

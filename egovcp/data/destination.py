@@ -7,30 +7,22 @@ work starts whether that is possible.
 from __future__ import annotations
 
 import os
-import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
 
 from filelock import FileLock, Timeout
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.outputs import nearest_existing, require_writable
 
-_MOUNTS: Final = Path("/proc/self/mountinfo")
-_MOUNT_POINT_FIELD: Final = 4  # proc_pid_mountinfo(5), counted from 0
-
 
 def resolve_root(root: str | Path) -> Path:
     """The absolute path of a dataset folder without symbolic links; it need not exist.
 
-    Locks, staging folders and renames must use this path: through a link they would replace the
-    link, and two writers that use different names would have different locks.
-
-    Raises:
-        UsageError: the links form a loop.
+    Locks and renames must use this path: through a link they would replace the link, and two
+    writers could hold different locks.
     """
     try:
         return Path(os.path.expanduser(root)).resolve()
@@ -47,12 +39,7 @@ def is_vacant(root: Path) -> bool:
 
 
 def require_new(root: Path) -> None:
-    """Raise unless ``root`` is absent or an empty folder, and can be created.
-
-    Raises:
-        UsageError: ``root`` is a file, is below a file, or is a folder that is not empty.
-        EnvironmentFailure: no permission, a read-only file system, or a mount point.
-    """
+    """Raise unless ``root`` is absent or an empty folder, and can be created and replaced."""
     if not is_vacant(root):
         raise UsageError(
             f"output folder {root} exists already and is not empty; choose another or remove it"
@@ -65,25 +52,11 @@ def require_new(root: Path) -> None:
 
 def require_replaceable(root: Path) -> None:
     """Raise `EnvironmentFailure` if ``root`` is a mount point, which cannot be renamed."""
-    if is_mount_point(root):
+    if os.path.ismount(root):
         raise EnvironmentFailure(
             f"{root} is a mount point; a dataset is replaced as a whole folder, which a mount "
             f"point does not allow: use a folder inside it, such as {root / 'dataset'}"
         )
-
-
-def is_mount_point(folder: Path) -> bool:
-    """Whether a file system is mounted at ``folder``, bind mounts included."""
-    return os.path.ismount(folder) or str(folder) in _mount_points()
-
-
-def _mount_points() -> set[str]:
-    try:
-        lines = _MOUNTS.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    except OSError:  # not Linux
-        return set()
-    fields = (line.split(" ")[_MOUNT_POINT_FIELD] for line in lines)
-    return {re.sub(r"\\(\d{3})", lambda octal: chr(int(octal[1], 8)), field) for field in fields}
 
 
 def make_parent(root: Path) -> None:
@@ -102,10 +75,8 @@ def _below_file(root: Path) -> UsageError:
 def writer_lock(root: Path, folder: Path) -> Iterator[None]:
     """Hold the lock of the dataset at ``root``, a file in ``folder``, within the block.
 
-    The system releases it when the process ends.
-
-    Raises:
-        EnvironmentFailure: immediately, if another process holds it.
+    The system releases it when the process ends. Raises `EnvironmentFailure` immediately if another
+    process holds it.
     """
     lock, owner, holder = FileLock(folder / "lock"), folder / "owner", "another process"
     try:

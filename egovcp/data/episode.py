@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.errors import DataError, suggest
+from egovcp.errors import DataError
 
+_SUM_SLACK = 1e-5  # float32 rounding of the sum of the reward terms
 _ACTION_SLACK = 1e-6  # float32 rounding of an action on the boundary of its box
 
 #: Longest episode, frames (33 minutes), because an episode is read as a whole.
@@ -29,7 +30,11 @@ FRAME_LAYOUT: Final[Mapping[str, FrameLayout]] = {
     "done": ((), np.bool_),
     "success": ((), np.bool_),
     "truncated": ((), np.bool_),
+    "reward_terms": ((len(spec.REWARD_TERMS),), np.float32),
+    "object": ((spec.OBJECT_DIM,), np.float32),
 }
+_OPTIONAL: Final = ("reward_terms", "object")
+_NOT_GIVEN: Final = np.empty((0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -54,11 +59,22 @@ class Episode:
     truncated: NDArray[np.bool_]
     """(T,) the episode ended with this row because of the time limit."""
     task: str
-    """One of ``spec.TASKS``."""
+    """Name of the task; it need not be installed."""
     time_limit: int
     """Planned length in planner ticks: T, unless a termination came first."""
     metadata: Mapping[str, Any] = field(default_factory=dict)
     """JSON-compatible facts: scenario seed and episode number, physics parameters."""
+    reward_terms: NDArray[np.float32] = field(default_factory=lambda: _NOT_GIVEN)
+    """(T, 6) the terms ``spec.REWARD_TERMS``, whose sum is the reward; zeros if not recorded."""
+    object: NDArray[np.float32] = field(default_factory=lambda: _NOT_GIVEN)
+    """(T, 4) position of the task's object, m, heading frame, at the time of the observation, and
+    whether it is known; zeros if not recorded."""
+
+    def __post_init__(self) -> None:
+        for name in _OPTIONAL:
+            if getattr(self, name) is _NOT_GIVEN:
+                shape, dtype = FRAME_LAYOUT[name]
+                object.__setattr__(self, name, np.zeros((len(self.reward), *shape), dtype))
 
     def __len__(self) -> int:
         return len(self.reward)
@@ -69,10 +85,15 @@ class Episode:
         return bool(self.done[-1] and not self.truncated[-1])
 
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of the arrays' little-endian bytes, independent of the storage."""
+        """Hexadecimal SHA-256 of the arrays' little-endian bytes, independent of the storage.
+
+        Optional arrays count only if they are recorded.
+        """
         out = hashlib.sha256()
         for name in FRAME_LAYOUT:
             array = np.ascontiguousarray(getattr(self, name))
+            if name in _OPTIONAL and not array.any():
+                continue
             out.update(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
         return out.hexdigest()
 
@@ -92,8 +113,8 @@ class Episode:
 
 
 def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
-    if episode.task not in spec.TASKS:
-        yield None, f"unknown task {episode.task!r}{suggest(episode.task, spec.TASKS)}"
+    if not episode.task:
+        yield None, "no task, expected its name"
     length = len(episode.reward)
     if length == 0:
         yield None, "no frames, expected at least one"
@@ -107,9 +128,13 @@ def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
 
 
 def _value_problems(episode: Episode) -> Iterator[tuple[int, str]]:
-    for name in ("state", "action", "reward"):
+    for name in ("state", "action", "reward", *_OPTIONAL):
         finite = np.isfinite(getattr(episode, name)).reshape(len(episode), -1).all(axis=1)
         yield from _where_not(finite, f"{name} is not finite")
+    total = episode.reward_terms.sum(1, dtype=np.float64)
+    differs = np.abs(total - episode.reward) > _SUM_SLACK * (1 + np.abs(episode.reward))
+    if episode.reward_terms.any():
+        yield from _where_not(~differs, "reward differs from the sum of reward_terms")
     inside = ~(np.abs(episode.action).max(axis=1) > 1 + _ACTION_SLACK)  # NaN is reported above
     yield from _where_not(inside, "action lies outside [-1, 1]")
     farthest = round(spec.DEPTH_MAX_M * 1000)

@@ -26,8 +26,7 @@ from egovcp.errors import DataError, UsageError, suggest
 
 SPLITS: Final = ("train", "heldout", "all")
 HELDOUT_FRACTION: Final = 0.05
-#: `describe_heldout` lists at most this many episode numbers.
-MAX_LISTED: Final = 5000
+MAX_LISTED: Final = 5000  # episode numbers
 RULE: Final = (
     "an episode is held out if uint64(SHA-256(task/seed/episode)[:8]) / 2**64 < fraction; if that "
     "selects none of at least two, the one with the lowest value"
@@ -37,15 +36,7 @@ RULE: Final = (
 def in_split(
     identities: Sequence[str], split: str, fraction: float = HELDOUT_FRACTION
 ) -> list[bool]:
-    """Whether each of the episodes with these identities belongs to ``split``.
-
-    An episode is held out if `_hash_fraction` of its identity is below ``fraction``. If that
-    selects none of at least two episodes, the one with the lowest value is held out, so that a
-    small dataset can be trained on, too.
-
-    Raises:
-        UsageError: no such split.
-    """
+    """Whether each of the episodes with these identities belongs to ``split`` (see `RULE`)."""
     if split not in SPLITS:
         raise UsageError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     if split == "all":
@@ -58,7 +49,6 @@ def in_split(
 
 
 def _hash_fraction(identity: str) -> float:
-    """The identity's hash as a number in [0, 1)."""
     digest = hashlib.sha256(identity.encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
 
@@ -83,9 +73,7 @@ class EpisodeIndex:
     ) -> Self:
         """The selected episodes of the datasets that belong to a split.
 
-        Raises:
-            DataError: the datasets cannot be mixed, or the split is empty.
-            UsageError: there is no such split.
+        Raises `DataError` if the datasets cannot be mixed, or the split is empty.
         """
         require_mixable(readers)
         places = [(d, i) for d, reader in enumerate(readers) for i in reader.selected.tolist()]
@@ -109,7 +97,6 @@ class EpisodeIndex:
         return self.select(np.sort(np.concatenate(kept)))
 
     def select(self, episodes: NDArray[np.int64]) -> EpisodeIndex:
-        """Some of its episodes."""
         return EpisodeIndex(self.readers, self.dataset[episodes], self.number[episodes])
 
     @cached_property
@@ -120,7 +107,6 @@ class EpisodeIndex:
 
     @property
     def num_frames(self) -> int:
-        """Frames of all episodes."""
         return int(self.length.sum())
 
     @property
@@ -140,7 +126,6 @@ class EpisodeIndex:
 
     @cached_property
     def fingerprint(self) -> str:
-        """`episodes_fingerprint` of its episodes."""
         return episodes_fingerprint(self.identities, self.length)
 
     @property
@@ -156,7 +141,6 @@ class EpisodeIndex:
             reader.download(number)
 
     def prefetch(self, episodes: Sequence[int]) -> None:
-        """Start to download the files of the episodes that are read next."""
         for reader in self.readers:
             if reader.is_remote:
                 places = map(self._place, episodes)
@@ -212,14 +196,9 @@ def require_mixable(readers: Sequence[DatasetReader]) -> None:
 def describe_heldout(
     readers: Sequence[DatasetReader], fraction: float = HELDOUT_FRACTION
 ) -> dict[str, Any]:
-    """JSON-compatible description of the held-out episodes of these datasets.
+    """JSON-compatible description of the held-out episodes; raises `DataError` if none is.
 
-    ``rule`` and ``fraction`` say how they are chosen, ``count`` is their number, ``fingerprint``
-    the hash of their identities and lengths, ``numbers`` lists them for each dataset (null if
-    they are more than `MAX_LISTED`).
-
-    Raises:
-        DataError: none is held out.
+    ``numbers`` lists them for each dataset, or is null if they are more than `MAX_LISTED`.
     """
     heldout = EpisodeIndex.of(readers, "heldout", fraction)
     numbers = [heldout.number[heldout.dataset == d].tolist() for d in range(len(readers))]

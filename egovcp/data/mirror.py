@@ -62,6 +62,11 @@ def mirror_state[F: np.floating](state: NDArray[F]) -> NDArray[F]:
     return np.asarray(state[..., STATE_SOURCE] * STATE_SIGN.astype(state.dtype))
 
 
+def mirror_position[F: np.floating](position: NDArray[F]) -> NDArray[F]:
+    """Reflected position ``(..., 3)`` in the heading frame."""
+    return np.asarray(position * np.array(_POLAR, position.dtype))
+
+
 def mirror_action[F: np.floating](action: NDArray[F]) -> NDArray[F]:
     """Reflected normalised action ``(..., 7)``; the action box is symmetric."""
     return np.asarray(action[..., ACTION_SOURCE] * ACTION_SIGN.astype(action.dtype))

@@ -11,7 +11,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp import spec
 from egovcp.data.index import EpisodeIndex
 from egovcp.errors import UsageError, suggest
 
@@ -34,21 +33,16 @@ class Mix:
 
     @property
     def is_plain(self) -> bool:
-        """Whether there are no weights."""
         return not self.datasets and not self.tasks
 
     def check(self) -> None:
         """Raise `UsageError` for invalid weights."""
-        for task in self.tasks:
-            if task not in spec.TASKS:
-                raise UsageError(f"a weight for unknown task {task!r}{suggest(task, spec.TASKS)}")
         weights = [*self.datasets, *self.tasks.values()]
         wrong = [weight for weight in weights if not (weight >= 0 and math.isfinite(weight))]
         if wrong:
             raise UsageError(f"a weight of {wrong[0]}: expected a finite number of at least 0")
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-compatible."""
         return {"datasets": list(self.datasets), "tasks": dict(sorted(self.tasks.items()))}
 
 
@@ -62,12 +56,13 @@ class EpisodeGroups(NamedTuple):
 def group_episodes(
     mix: Mix, dataset: NDArray[np.int64], tasks: Sequence[str], length: NDArray[np.int64]
 ) -> EpisodeGroups:
-    """Group episodes by ``dataset`` (E,) and ``tasks`` (E,), and compute the share of each group.
-
-    Raises:
-        UsageError: the weights are not valid, or all shares are zero.
-    """
+    """Groups of the episodes by ``dataset`` (E,) and ``tasks`` (E,), with their shares."""
     mix.check()
+    for task in mix.tasks:
+        if task not in tasks:
+            raise UsageError(
+                f"a weight for task {task!r}, of which there is no episode{suggest(task, {*tasks})}"
+            )
     if mix.datasets and len(mix.datasets) <= dataset.max():
         raise UsageError(f"{len(mix.datasets)} weights for {dataset.max() + 1} datasets")
     if mix.is_plain:
@@ -106,11 +101,7 @@ class EpisodeOrder:
     def __init__(
         self, index: EpisodeIndex, groups: EpisodeGroups, rank: int, ranks: int, seed: int
     ) -> None:
-        """Assign the files to ``ranks`` processes, of which this is ``rank``; shards are disjoint.
-
-        Raises:
-            UsageError: ``rank`` is out of range, or a group has fewer episodes than processes.
-        """
+        """Take the files of process ``rank`` of ``ranks``; shards are disjoint."""
         if not 0 <= rank < ranks:
             raise UsageError(f"rank {rank} of {ranks}: expected to count from 0")
         self._seed = (seed, rank)
@@ -145,7 +136,6 @@ class EpisodeOrder:
         return [int(e) for cursor, part in groups for e in part[cursor : cursor + LOOKAHEAD]]
 
     def state_dict(self) -> dict[str, Any]:
-        """JSON-compatible."""
         return {"epoch": list(self._epoch), "cursor": list(self._cursor)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -164,7 +154,6 @@ class EpisodeOrder:
 
 
 def _files(index: EpisodeIndex, chosen: NDArray[np.bool_]) -> list[Numbers]:
-    """The chosen episodes by file."""
     files = index.files
     numbers = np.flatnonzero(chosen).tolist()
     return [np.array(list(part)) for _, part in groupby(numbers, key=lambda n: files[n])]

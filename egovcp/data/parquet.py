@@ -6,7 +6,7 @@ The sizes in the footer are therefore checked before anything is read.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +25,7 @@ from egovcp.files import require_regular
 
 ROW_GROUP_ROWS: Final = 65_536
 """Largest number of rows of a row group, which is read as a whole: 0.4 GB of depth."""
+_OTHER_GROUP_ROWS: Final = 1 << 20  # what pyarrow writes by default
 _ROW_BYTES: Final = 65_536  # bounds a column chunk: ten times a depth image
 _ROW_VALUES: Final = 4096
 _CHUNK_BYTES: Final = 1 << 30
@@ -51,6 +52,8 @@ EPISODE_FEATURES = {
     "done": spec.DONE_KEY,
     "success": spec.SUCCESS_KEY,
     "truncated": spec.TRUNCATED_KEY,
+    "reward_terms": spec.REWARD_TERMS_KEY,
+    "object": spec.OBJECT_KEY,
 }
 
 
@@ -70,22 +73,20 @@ def data_errors(path: Path) -> Iterator[None]:
         raise DataError.at(path, f"damaged: {reason}") from error
 
 
-def open_parquet(path: Path, rows: int | None = None) -> pq.ParquetFile:
+def open_parquet(path: Path, rows: int | None = None, own: bool = True) -> pq.ParquetFile:
     """Open a parquet file whose row groups can be read safely.
 
     The file is not memory-mapped: mapped pages count as memory of this process while the file is
     open, and truncation of the file would end the process. ``rows`` limits the number of rows.
-
-    Raises:
-        DataError: it is missing, damaged, or its footer has sizes that no dataset has.
+    If not ``own``, the limits allow larger row groups and images than egovcp writes.
     """
     with data_errors(path):
         size = require_regular(path).st_size
         file = pq.ParquetFile(path)
-        for problem in _row_problems(file.metadata, rows):
+        for problem in _row_problems(file.metadata, rows, own):
             raise DataError.at(path, problem)
         _parse_column_chunks(path)
-        for problem in _column_problems(file.metadata, size):
+        for problem in _column_problems(file.metadata, size, own):
             raise DataError.at(path, problem)
         return file
 
@@ -100,7 +101,8 @@ def _parse_column_chunks(path: Path) -> None:
         next(file.iter_batches(batch_size=1, use_threads=False), None)
 
 
-def _row_problems(content: pq.FileMetaData, rows: int | None) -> Iterator[str]:
+def _row_problems(content: pq.FileMetaData, rows: int | None, own: bool) -> Iterator[str]:
+    group_rows = ROW_GROUP_ROWS if own else _OTHER_GROUP_ROWS
     if content.num_columns > _COLUMNS:
         yield f"has {content.num_columns} columns, expected at most {_COLUMNS}"
     if content.num_rows < 0 or (rows is not None and content.num_rows > rows):
@@ -110,9 +112,9 @@ def _row_problems(content: pq.FileMetaData, rows: int | None) -> Iterator[str]:
     for number in range(content.num_row_groups):
         group = content.row_group(number)
         total += group.num_rows
-        if not 0 <= group.num_rows <= ROW_GROUP_ROWS:
+        if not 0 <= group.num_rows <= group_rows:
             found = f"row group {number} has {group.num_rows} rows"
-            yield f"{found}, expected at most {ROW_GROUP_ROWS}"
+            yield f"{found}, expected at most {group_rows}"
         if group.num_columns != content.num_columns:
             found = f"row group {number} has {group.num_columns} columns"
             yield f"{found}, expected {content.num_columns}"
@@ -120,21 +122,22 @@ def _row_problems(content: pq.FileMetaData, rows: int | None) -> Iterator[str]:
         yield f"has {content.num_rows} rows, but its row groups {total}"
 
 
-def _column_problems(content: pq.FileMetaData, size: int) -> Iterator[str]:
+def _column_problems(content: pq.FileMetaData, size: int, own: bool) -> Iterator[str]:
+    row_bytes, row_values = (_ROW_BYTES, _ROW_VALUES) if own else (_CHUNK_BYTES, _CHUNK_BYTES)
     stored = content.serialized_size
     for number in range(content.num_row_groups):
         group = content.row_group(number)
         for index in range(group.num_columns):
             column = group.column(index)
             stored += max(0, column.total_compressed_size)
-            limit = min(_CHUNK_BYTES, _ROW_BYTES * (group.num_rows + 1))
-            if not 0 <= column.total_uncompressed_size <= limit:
-                found = f"holds {column.total_uncompressed_size} bytes"
-                yield f"column {column.path_in_schema} {found}, expected at most {limit}"
-            values = _ROW_VALUES * (group.num_rows + 1)
-            if not 0 <= column.num_values <= values:
-                found = f"holds {column.num_values} values"
-                yield f"column {column.path_in_schema} {found}, expected at most {values}"
+            rows = group.num_rows + 1
+            for unit, held, limit in (
+                ("bytes", column.total_uncompressed_size, min(_CHUNK_BYTES, row_bytes * rows)),
+                ("values", column.num_values, row_values * rows),
+            ):
+                if not 0 <= held <= limit:
+                    name = column.path_in_schema
+                    yield f"column {name} holds {held} {unit}, expected at most {limit}"
     if size > stored + _PADDING_BYTES:
         yield f"has {size} bytes, but its row groups only {stored}"
 
@@ -147,6 +150,22 @@ def open_data_file(root: Path, path: Path) -> pq.ParquetFile:
         for problem in schema.type_problems(file.schema_arrow):
             raise DataError.at(path, problem)
     return file
+
+
+def read_columns(table: pa.Table, names: Iterable[str]) -> Columns:
+    """Columns of a table as arrays (see `to_numpy`); absent optional columns are zeros."""
+    absent = {name for name in spec.OPTIONAL_KEYS if name not in table.column_names}
+    return {
+        name: np.zeros((table.num_rows, schema.width(name)), np.float32)
+        if name in absent
+        else to_numpy(table[name], name)
+        for name in names
+    }
+
+
+def present_columns(names: Iterable[str], found: Container[str]) -> list[str]:
+    """``names`` without the optional columns that are not in ``found``."""
+    return [name for name in names if name in found or name not in spec.OPTIONAL_KEYS]
 
 
 def to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:

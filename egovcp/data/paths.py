@@ -10,23 +10,27 @@ from egovcp.errors import DataError
 _FIELD = re.compile(r"\{(?:chunk_index|file_index)(?::0?[1-9]?d)?\}")
 
 
-def check_template(template: object, path: Path) -> None:
-    """Raise `DataError` unless ``template``, read from ``path``, names files inside the dataset.
+def check_template(template: object, path: Path, folder: str = "data") -> None:
+    """Raise `DataError` unless ``template``, read from ``path``, names files inside ``folder``, of
+    the dataset.
 
     Only plain fields are allowed, because Python's format language can read attributes.
     """
+    name = "data_path" if folder == "data" else "video_path"
     if not isinstance(template, str):
-        raise DataError.at(path, f"data_path {template!r} is not a file template")
+        raise DataError.at(path, f"{name} {template!r} is not a file template")
     parts = PurePosixPath(template)
     if parts.is_absolute() or ".." in parts.parts:
-        raise DataError.at(path, f"data_path {template!r} leads outside of the dataset")
+        raise DataError.at(path, f"{name} {template!r} leads outside of the dataset")
     if any(part.startswith(".") for part in parts.parts):
-        raise DataError.at(path, f"data_path {template!r} names hidden files")
+        raise DataError.at(path, f"{name} {template!r} names hidden files")
     plain = _FIELD.sub("", template)
-    if not template.startswith("data/") or re.search(r"[^\w./-]", plain, re.ASCII):
+    if folder == "videos":
+        plain = plain.replace("{video_key}", "")
+    if not template.startswith(f"{folder}/") or re.search(r"[^\w./-]", plain, re.ASCII):
         raise DataError.at(
             path,
-            f"data_path {template!r} is not a file template; expected one below data/ "
+            f"{name} {template!r} is not a file template; expected one below {folder}/ "
             "with the fields chunk_index and file_index",
         )
 

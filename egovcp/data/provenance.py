@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from egovcp.data import schema
 from egovcp.errors import DataError
@@ -79,12 +79,10 @@ def source_index(count: int, facts: Mapping[str, Any]) -> int:
     return source
 
 
-@dataclass(frozen=True)
-class ScenarioKey:
+class ScenarioKey(NamedTuple):
     """Two collected episodes with equal keys simulate the same scenario."""
 
-    provenance: str
-    """JSON of the controller, versions and configuration."""
+    provenance: str  # JSON of the controller, versions and configuration
     task: str
     seed: str
     number: str
@@ -93,13 +91,13 @@ class ScenarioKey:
         return f"{self.task}/{self.seed}/{self.number} (task/seed/number)"
 
 
-def _scenario_settings(origin: Provenance) -> dict[str, Any]:
-    """Settings on which a scenario depends besides task, seed and number."""
+def _scenario_settings(origin: Provenance) -> str:
+    """JSON of the settings on which a scenario depends besides task, seed and number."""
     settings = asdict(replace(origin, command="", seed=None))
     env = settings["config"].get("env")
     if isinstance(env, dict):  # may name the controller by a path; controller_id identifies it
         settings["config"]["env"] = {k: v for k, v in env.items() if k != "controller"}
-    return settings
+    return json.dumps(settings, sort_keys=True)
 
 
 class ScenarioKeys:
@@ -108,7 +106,7 @@ class ScenarioKeys:
     def __init__(self, origin: Provenance) -> None:
         """Raises `DataError` if ``origin`` is damaged."""
         self._parts = source_provenances(origin)
-        self._texts = [json.dumps(_scenario_settings(part), sort_keys=True) for part in self._parts]
+        self._settings = list(map(_scenario_settings, self._parts))
 
     def key(self, task: str, facts: Mapping[str, Any]) -> ScenarioKey | None:
         """The key of an episode; None if it has no number, as a recorded rollout."""
@@ -116,18 +114,18 @@ class ScenarioKeys:
             return None
         source = source_index(len(self._parts), facts)
         seed = facts.get("seed", self._parts[source].seed)
-        return ScenarioKey(self._texts[source], task, str(seed), str(facts["episode"]))
+        return ScenarioKey(self._settings[source], task, str(seed), str(facts["episode"]))
 
 
-@dataclass(frozen=True)
-class Duplicate[P]:
-    """An earlier episode that is repeated by a later one."""
+class Duplicate[P](NamedTuple):
+    """An earlier episode that is repeated by a later one.
+
+    If its content is not ``equal``, seed, number and provenance are: one of the two was altered, or
+    they were simulated on different machines.
+    """
 
     place: P
-    """Place of the earlier episode."""
     equal: bool
-    """Whether the content is equal. If not, seed, number and provenance are: one of the two was
-    altered, or they were simulated on different machines."""
 
     def problem(self, scenario: ScenarioKey | None) -> str:
         """Description of the problem of the later episode, which simulates ``scenario``."""

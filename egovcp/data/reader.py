@@ -1,20 +1,14 @@
 """Reads a dataset straight from parquet: by episode, by column, or as arrays [Batch, Time, Data].
 
-All episodes at once, padded to the longest::
-
-    data = load_arrays("data/ball")            # or a Hub id: load_arrays("me/egovcp-ball")
-    data["action"]                             # (B, T, 7) float32
-    data["valid"]                              # (B, T) bool, False after an episode's end
-
-or episode by episode, read on demand::
-
-    for episode in open_dataset("data/ball"):
-        episode.depth                          # (T, 48, 64) uint16, mm
+load_arrays("data/ball")["action"]         # (B, T, 7); or a Hub id: "me/egovcp-ball"
+for episode in open_dataset("data/ball"):  # read on demand
+    episode.depth                          # (T, 48, 64) uint16, mm
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -31,7 +25,14 @@ from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
 from egovcp.data.episode import Episode
-from egovcp.data.parquet import EPISODE_FEATURES, Columns, data_errors, open_data_file, to_numpy
+from egovcp.data.parquet import (
+    EPISODE_FEATURES,
+    Columns,
+    data_errors,
+    open_data_file,
+    present_columns,
+    read_columns,
+)
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
 from egovcp.data.source import Source, is_local, locate, open_file_cache, select_episodes
@@ -55,10 +56,6 @@ class DatasetReader:
             source: the dataset's folder.
             cache: downloads the data files when they are read; None: they are in the folder.
             episodes: the selected episodes (see `select_episodes`).
-
-        Raises:
-            UsageError: a selected episode does not exist.
-            DataError: the dataset is damaged, incomplete, or of another specification.
         """
         self.source = source
         self.root = source.root
@@ -91,17 +88,21 @@ class DatasetReader:
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
-        """Open the dataset that ``config`` names, from disk or from the Hub.
+        """Open the dataset that ``config`` names, from disk or from the Hub (see `locate`).
 
-        The network is not used if a root is given, or if LeRobot's local folder has the dataset
-        and no revision is given.
-
-        Raises:
-            UsageError: the configuration names no dataset.
-            DataError: there is none, or not one of this specification.
-            EnvironmentFailure: the Hub cannot be reached.
+        If a collector replaces it by its next version meanwhile, it is opened again.
         """
-        reader = cls(locate(config), episodes=_selection(config))
+        source = locate(config)
+        while True:
+            version = os.stat(source.root).st_ino
+            try:
+                reader = cls(source, episodes=_selection(config))
+            except DataError:
+                if os.stat(source.root).st_ino == version:
+                    raise
+            else:
+                if os.stat(source.root).st_ino == version:
+                    break
         for path in reader.frames_per_file:
             require_file(reader.root, path)
         return reader
@@ -129,7 +130,6 @@ class DatasetReader:
 
     @property
     def num_frames(self) -> int:
-        """Frames of all episodes."""
         return int(self.lengths.sum())
 
     @property
@@ -144,6 +144,11 @@ class DatasetReader:
     def fps(self) -> int:
         """Rows per second."""
         return int(self.info["fps"])
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The keys of `schema.FEATURES` that the dataset has."""
+        return tuple(key for key in schema.FEATURES if key in self.info["features"])
 
     @property
     def controller_id(self) -> str:
@@ -168,7 +173,6 @@ class DatasetReader:
         return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
     def task(self, index: int) -> str:
-        """Task of an episode."""
         return str(self.records[index]["task"])
 
     def metadata(self, index: int) -> Mapping[str, Any]:
@@ -198,16 +202,10 @@ class DatasetReader:
             raise DataError.at(self.root / schema.COLLECTION_PATH, error.problem, index) from error
 
     def data_path(self, index: int) -> Path:
-        """The file that holds an episode."""
         return self.root / self._name(index)
 
     def read(self, index: int) -> Episode:
-        """Read one episode, validate it and compare it with its recorded digest.
-
-        Raises:
-            DataError: the file is damaged or its content violates the specification.
-            IndexError: there is no such episode.
-        """
+        """Read one episode; raises the first of its problems (see `inspect`)."""
         episode, problems = self.inspect(index)
         for error in problems:
             raise error
@@ -245,9 +243,7 @@ class DatasetReader:
     def read_episode_columns(self, index: int, names: Sequence[str]) -> Columns:
         """Some columns of one episode, ``(T, ...)`` each, not validated.
 
-        Raises:
-            DataError: there is no such column, or the file is damaged.
-            IndexError: there is no such episode.
+        Optional columns that the dataset lacks are zeros.
         """
         for name in names:
             if name not in schema.FEATURES:
@@ -260,7 +256,7 @@ class DatasetReader:
                 table = self._rows(path, index, names)
                 if table.num_rows != self.lengths[index]:
                     raise DataError("ends before the end of the episode")
-                return {name: to_numpy(table[name], name) for name in names}
+                return read_columns(table, names)
         except DataError as error:
             raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
@@ -270,7 +266,6 @@ class DatasetReader:
             self._cache.get(self._name(index))
 
     def prefetch(self, indices: Sequence[int]) -> None:
-        """Start to download the files of the episodes that are read next."""
         if self._cache is not None:
             self._cache.prefetch(map(self._name, indices))
 
@@ -296,6 +291,7 @@ class DatasetReader:
     def _rows(self, path: Path, index: int, names: Sequence[str]) -> pa.Table:
         """The rows of an episode, from the row groups that hold them."""
         # The file names of depth frames are not read.
+        names = present_columns(names, self.features)
         columns = [f"{name}.bytes" if name == spec.DEPTH_KEY else name for name in names]
         first = int(self._table.start[index] - self._file_start[index])
         last = first + int(self.lengths[index])
@@ -344,13 +340,7 @@ def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
 
 
 def open_dataset(where: str | Path, revision: str = "") -> DatasetReader:
-    """Open a folder, or ``user/name`` on the Hub at a branch, tag or commit SHA.
-
-    Raises:
-        UsageError: no dataset is named, or a revision of a folder.
-        DataError: there is no such folder, or it is damaged or of another specification.
-        EnvironmentFailure: the Hub cannot be reached.
-    """
+    """Open a folder, or ``user/name`` on the Hub at a branch, tag or commit SHA (see `locate`)."""
     if not isinstance(where, str) or is_local_path(where):
         return DatasetReader.open(DatasetConfig(root=str(where), revision=revision))
     return DatasetReader.open(DatasetConfig(repo_id=str(where), revision=revision))
@@ -361,15 +351,9 @@ def load_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Whole columns of a dataset of B episodes as (B, T, ...), T the longest episode's frames.
 
-    Frames after the end of an episode are zeros, and False in the additional array ``valid``
-    (B, T). Depth takes 6 kB per frame: omit it from ``columns`` if it is not needed.
-
-    Args:
-        dataset: a folder, an id on the Hub, or an open dataset.
-        columns: LeRobot feature names, keys of ``schema.FEATURES``.
-
-    Raises:
-        DataError: there is no such column, or the dataset is damaged.
+    ``columns`` are keys of ``schema.FEATURES``. Frames after the end of an episode are zeros, and
+    False in the additional array ``valid`` (B, T). Depth takes 6 kB per frame: omit it from
+    ``columns`` if it is not needed.
     """
     reader = dataset if isinstance(dataset, DatasetReader) else open_dataset(dataset)
     longest = int(reader.lengths.max())

@@ -9,7 +9,8 @@ drop those of survivors.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
+from egovcp.errors import UsageError, suggest
 
 ReturnScaling = Literal["dataset", "none", "per_task"]
 
@@ -29,6 +31,9 @@ class ReturnConfig:
     """Discount per planner tick."""
     steps: int = bounded(spec.RETURN_STEPS, least=1, most=100_000)
     """Horizon K, planner ticks."""
+    weights: dict[str, float] = field(default_factory=dict)
+    """Weights of reward terms, '{block: 2.0}'; 1 for terms not listed, 0 for those that the planner
+    computes (pose, action_rate)."""
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""
     scale: ReturnScaling = "dataset"
@@ -38,20 +43,38 @@ class ReturnConfig:
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for invalid values."""
         check_bounds(self, f"{flag}.")
+        for name, weight in self.weights.items():
+            if name not in spec.REWARD_TERMS:
+                raise UsageError(
+                    f"{flag}.weights: unknown reward term {name!r}"
+                    f"{suggest(name, spec.REWARD_TERMS)}"
+                )
+            if not math.isfinite(weight):
+                raise UsageError(f"{flag}.weights: {name} is {weight}, expected a finite number")
+
+    @property
+    def term_weights(self) -> NDArray[np.float64]:
+        """(6,) weight of each of ``spec.REWARD_TERMS`` in the target of Q."""
+        default = {name: float(name not in spec.ACTION_TERMS) for name in spec.REWARD_TERMS}
+        return np.array(list((default | self.weights).values()))
+
+    def target_reward(
+        self, reward: NDArray[np.floating], terms: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """The weighted sum (T,) of the reward terms (T, 6) of ``reward`` (T,).
+
+        Of an episode without recorded terms (zeros), the reward itself.
+        """
+        extra = np.asarray(terms, np.float64) @ (self.term_weights - 1.0)
+        return (reward + extra).astype(np.float32)
 
 
 def mc_return(
     reward: NDArray[np.floating], gamma: float = spec.GAMMA, steps: int = spec.RETURN_STEPS
 ) -> NDArray[np.float32]:
-    """Discounted sum of the next ``steps`` rewards at every row of one episode.
+    """Discounted sum (T,) of the next ``steps`` rewards at every row of one episode.
 
-    Args:
-        reward: (T,) reward after the action of each row.
-        gamma: discount per planner tick.
-        steps: horizon K; rewards past the episode's end count as zero.
-
-    Returns:
-        (T,) returns.
+    ``reward`` (T,) is that after each row's action; rewards past the episode's end count as zero.
     """
     discount = gamma ** np.arange(steps, dtype=np.float64)
     padded = np.concatenate([np.asarray(reward, dtype=np.float64), np.zeros(steps - 1)])
@@ -63,12 +86,8 @@ def mc_valid(
 ) -> NDArray[np.bool_]:
     """Rows of one episode whose return is not cut short by the time limit, ``(length,)``.
 
-    Args:
-        length: rows of the episode.
-        time_limit: planned rows; more than ``length`` after a termination.
-        steps: horizon K of the return.
-        keep_truncated: every row is valid: the paper's truncated returns, whose bias is
-            the epsilon-bar of its section III-D.
+    With ``keep_truncated`` every row is valid: the paper's truncated returns, whose bias is the
+    epsilon-bar of its section III-D.
     """
     return (np.arange(length) + steps <= time_limit) | keep_truncated
 

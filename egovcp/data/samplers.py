@@ -1,8 +1,5 @@
 """Endless training batches ``[B, T, ...]`` of windows of episodes, exactly resumable.
 
-`InMemorySampler` draws from an `EpisodeStore`, `StreamingSampler` from a few episodes at a time,
-and `PrefetchIterator` makes the next batch in a thread.
-
 A window is placed by drawing a row and its position within the window, then moving the
 window inside the episode: all rows are covered, the first and the last ones (where
 memory starts from nothing, and where falls are) somewhat more often. Only an episode
@@ -46,7 +43,6 @@ class SamplerConfig:
     """Seed of all draws."""
 
     def check(self) -> None:
-        """Raise `UsageError` for invalid values."""
         if self.batch_size < 1 or self.length < 1 or self.burn_in < 0:
             raise UsageError(
                 f"batch_size {self.batch_size}, length {self.length}, burn_in {self.burn_in}: "
@@ -69,7 +65,6 @@ class ShuffleConfig:
     """How often the rows of an episode are used, on average, before it is replaced."""
 
     def check(self) -> None:
-        """Raise `UsageError` for invalid values."""
         check_bounds(self, "shuffle.")
 
 
@@ -84,11 +79,7 @@ class InMemorySampler:
         windows: slice = ALL_WINDOWS,
     ) -> None:
         """Make the part ``windows`` of each batch: processes that train together draw the same
-        batch, have the same state, and make different parts.
-
-        Raises:
-            UsageError: the configuration is not valid.
-        """
+        batch, have the same state, and make different parts."""
         config.check()
         self.store, self.config, self.mix = store, config, mix
         self._part = windows
@@ -169,9 +160,6 @@ class StreamingSampler:
         Args:
             checked: all episodes were validated; if not, each is validated when it is first read.
             rank: this process of ``ranks`` that train together; each has its own episodes.
-
-        Raises:
-            UsageError: the configuration is not valid.
         """
         self._shuffle = shuffle or ShuffleConfig()
         self._shuffle.check()

@@ -54,7 +54,7 @@ def width(key: str) -> int:
 def type_problems(found: pa.Schema) -> Iterator[str]:
     """Problems of the columns of a data file; lists may be of fixed size or not."""
     expected = arrow_schema()
-    for name in sorted(set(expected.names) - set(found.names)):
+    for name in sorted(set(expected.names) - set(found.names) - set(spec.OPTIONAL_KEYS)):
         yield f"column {name} is missing"
     for field in found:
         if field.name in expected.names:

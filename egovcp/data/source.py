@@ -93,11 +93,6 @@ def open_file_cache(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -
     """Download the `meta` folder of a dataset on the Hub; the cache downloads its other files.
 
     If the Hub cannot be reached, a complete `meta` folder of an earlier download is used.
-
-    Raises:
-        UsageError: bad or missing id.
-        DataError: the Hub has no such dataset or revision.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     _require_repo_id(config.repo_id)
     return HubFileCache(config.repo_id, config.revision, retry, _hub_cache(), ["meta/*"])
@@ -137,19 +132,11 @@ def _hub_cache() -> Path:
 
 
 def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> NDArray[np.int64]:
-    """The selected episode numbers, ascending and unique; all if ``text`` is empty.
+    """The selected ones of ``count`` episodes, ascending and unique; all if ``text`` is empty.
 
-    A single number needs brackets: YAML reads an unquoted ``1:30`` as the number 90, which must not
-    be taken for an episode.
-
-    Args:
-        text: numbers and ranges ``first:end`` without the end, separated by commas; either end of
-            a range may be omitted. May be in brackets or parentheses.
-        count: episodes of the dataset.
-        flag: the option, for messages.
-
-    Raises:
-        UsageError: ``text`` is malformed, selects nothing, or an episode that does not exist.
+    ``text`` holds numbers and ranges ``first:end`` without the end, separated by commas; either end
+    of a range may be omitted. A single number needs brackets: YAML reads an unquoted ``1:30`` as
+    the number 90, which must not be taken for an episode. ``flag`` is the option, for messages.
     """
     inner = text.strip()
     if not inner:

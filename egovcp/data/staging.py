@@ -166,7 +166,6 @@ class StagingDir:
         files.sync(self.folder)
 
     def numbers(self) -> set[int]:
-        """Numbers of the staged episodes."""
         return {number for number, _ in self._files()}
 
     def get(self, number: int) -> EncodedEpisode | None:
@@ -193,7 +192,6 @@ class StagingDir:
                 path.unlink(missing_ok=True)
 
     def size(self) -> int:
-        """Bytes on disk."""
         return sum(path.stat().st_size for _, path in self._files() if path.exists())
 
     def _files(self) -> Iterator[tuple[int, Path]]:

@@ -82,7 +82,6 @@ def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
 
 
 def to_json(matrix: Matrix, count: int) -> dict[str, dict[str, object]]:
-    """The content of ``stats.json``."""
     return {
         key: {
             **{row: _nested(key, matrix[None, i, part])[0] for i, row in enumerate(ROWS)},

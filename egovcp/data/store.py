@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.data import privileged
 from egovcp.data.episode import FRAME_LAYOUT, Episode, FrameLayout
 from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, episodes_fingerprint
 from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
@@ -17,9 +18,11 @@ from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
 
 type Batch = dict[str, NDArray[Any]]
 
-_FROM_EPISODE: Final = ("depth", "state", "action", "reward", "done", "success")
+_FROM_EPISODE: Final = ("depth", "state", "action", "done", "success")
 _ARRAYS: Final[Mapping[str, FrameLayout]] = {
     **{name: FRAME_LAYOUT[name] for name in _FROM_EPISODE},
+    "privileged": ((privileged.DIM,), np.float32),
+    "reward": FRAME_LAYOUT["reward"],
     "prev_action": FRAME_LAYOUT["action"],
     "terminal_next": ((), np.bool_),
     "mc_return": ((), np.float32),
@@ -29,28 +32,26 @@ _ARRAYS: Final[Mapping[str, FrameLayout]] = {
 
 @dataclass(frozen=True)
 class EpisodeStore:
-    """N frames of E episodes, one after the other."""
+    """N frames of E episodes, one after the other; arrays without another shape are (N,)."""
 
     depth: NDArray[np.uint16]
-    """(N, 48, 64) mm."""
+    """(N, 48, 64) mm; (0, 48, 64) if the images were left out."""
     state: NDArray[np.float32]
     """(N, 74)."""
     action: NDArray[np.float32]
     """(N, 7)."""
     prev_action: NDArray[np.float32]
     """(N, 7) action of the row before; zeros, the neutral pose, at the first row."""
+    privileged: NDArray[np.float32]
+    """(N, F) `egovcp.data.privileged`."""
     reward: NDArray[np.float32]
-    """(N,)."""
+    """(N,) see `ReturnConfig.target_reward`."""
     done: NDArray[np.bool_]
-    """(N,)."""
     success: NDArray[np.bool_]
-    """(N,)."""
     terminal_next: NDArray[np.bool_]
     """(N,) the row's action led to a failure."""
     mc_return: NDArray[np.float32]
-    """(N,)."""
     mc_valid: NDArray[np.bool_]
-    """(N,)."""
     start: NDArray[np.int64]
     """(E,) first frame of each episode."""
     length: NDArray[np.int64]
@@ -79,9 +80,11 @@ class EpisodeStore:
         return cls.read(index if per_task is None else index.subsample(per_task), returns)
 
     @classmethod
-    def read(cls, index: EpisodeIndex, returns: ReturnConfig | None = None) -> Self:
-        """Read and validate all episodes of an index."""
-        store = cls.empty(index.length, index.dataset, index.tasks, index.identities)
+    def read(
+        cls, index: EpisodeIndex, returns: ReturnConfig | None = None, images: bool = True
+    ) -> Self:
+        """Read and validate all episodes of an index, and store their images or not."""
+        store = cls.empty(index.length, index.dataset, index.tasks, index.identities, images)
         for number in range(len(index)):
             store.fill(number, index.read(number), returns or ReturnConfig())
         return store
@@ -93,11 +96,12 @@ class EpisodeStore:
         dataset: NDArray[np.int64],
         tasks: tuple[str, ...] = (),
         identities: tuple[str, ...] = (),
+        images: bool = True,
     ) -> Self:
         """Allocate arrays for episodes of these lengths."""
         frames = int(length.sum())
         arrays: dict[str, NDArray[Any]] = {
-            name: np.empty((frames, *shape), dtype=dtype)
+            name: np.empty((frames if images or name != "depth" else 0, *shape), dtype=dtype)
             for name, (shape, dtype) in _ARRAYS.items()
         }
         start = length.cumsum() - length
@@ -115,23 +119,25 @@ class EpisodeStore:
         first = int(self.start[number])
         rows = slice(first, first + len(episode))
         for name in _FROM_EPISODE:
-            getattr(self, name)[rows] = getattr(episode, name)
+            if name != "depth" or len(self.depth):
+                getattr(self, name)[rows] = getattr(episode, name)
+        self.privileged[rows] = privileged.privileged_features(episode.object, episode.reward_terms)
         self.prev_action[first] = 0.0
         self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
         self.terminal_next[rows] = is_terminal(episode.done, episode.truncated)
-        self.mc_return[rows] = mc_return(episode.reward, config.gamma, config.steps)
+        reward = config.target_reward(episode.reward, episode.reward_terms)
+        self.reward[rows] = reward
+        self.mc_return[rows] = mc_return(reward, config.gamma, config.steps)
         self.mc_valid[rows] = mc_valid(
             len(episode), episode.time_limit, config.steps, config.keep_truncated
         )
 
     @property
     def num_frames(self) -> int:
-        """Frames of all episodes."""
         return len(self.reward)
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the episodes' identities and lengths, in order."""
         return episodes_fingerprint(self.identities, self.length)
 
 
@@ -140,10 +146,8 @@ def gather(
 ) -> Batch:
     """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
 
-    Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
-    valid, mc_return, mc_valid, terminal_next; episode [B] and t [B, span] for reports.
-    Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
-    flags false.
+    Keys: the arrays of the store, is_first, valid; for reports episode [B], t [B, span]. Past the
+    episode's end the last row is repeated with ``valid``, ``mc_valid`` and the flags false.
     """
     end = store.start[episode] + store.length[episode]
     wanted = start[:, None] + np.arange(span)
@@ -152,7 +156,15 @@ def gather(
     t = rows - store.start[episode][:, None]
     batch: Batch = {
         name: getattr(store, name)[rows]
-        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return")
+        for name in (
+            "depth",
+            "state",
+            "action",
+            "prev_action",
+            "privileged",
+            "reward",
+            "mc_return",
+        )
     }
     for name in ("done", "success", "terminal_next", "mc_valid"):
         batch[name] = getattr(store, name)[rows] & valid
@@ -164,5 +176,6 @@ def mirror_windows(batch: Batch, windows: NDArray[np.intp]) -> None:
     """Reflect some windows of a batch left to right, in place."""
     batch["depth"][windows] = mirror_depth(batch["depth"][windows])
     batch["state"][windows] = mirror_state(batch["state"][windows])
+    batch["privileged"][windows] = privileged.mirror_privileged(batch["privileged"][windows])
     for name in ("action", "prev_action"):
         batch[name][windows] = mirror_action(batch[name][windows])

@@ -19,32 +19,25 @@ from numpy.typing import NDArray
 
 from egovcp.errors import DataError
 
-_SHORT, _LONG = 3, 4
-_ENTRY_BYTES = 12
-_BITS = 16
-
 
 @cache
 def header(rows: int, cols: int) -> bytes:
-    """The bytes before the pixels of a (rows, cols) uint16 TIFF."""
-    strip_bytes = rows * cols * _BITS // 8
-    entries = [  # (tag, type, value), TIFF 6.0 section 8
-        (256, _LONG, cols),  # ImageWidth
-        (257, _LONG, rows),  # ImageLength
-        (258, _SHORT, _BITS),  # BitsPerSample
-        (259, _SHORT, 1),  # Compression: none
-        (262, _SHORT, 1),  # PhotometricInterpretation: black is zero
-        (273, _LONG, 0),  # StripOffsets, filled in below
-        (278, _LONG, rows),  # RowsPerStrip
-        (279, _LONG, strip_bytes),  # StripByteCounts
-        (284, _SHORT, 1),  # PlanarConfiguration: chunky
-    ]
-    size = 8 + 2 + _ENTRY_BYTES * len(entries) + 4
+    """The bytes before the pixels of a (rows, cols) uint16 TIFF (TIFF 6.0, section 8)."""
+    entries = {  # tag -> type (3: uint16, 4: uint32) and value
+        256: (4, cols),
+        257: (4, rows),
+        258: (3, 16),  # bits per sample
+        259: (3, 1),  # no compression
+        262: (3, 1),  # black is zero
+        273: (4, 122),  # offset of the pixels, the length of this header
+        278: (4, rows),  # rows per strip
+        279: (4, 2 * rows * cols),  # bytes of the strip
+        284: (3, 1),  # one plane
+    }
     directory = b"".join(
-        struct.pack("<HHII", tag, kind, 1, size if tag == 273 else value)
-        for tag, kind, value in entries
+        struct.pack("<HHII", tag, kind, 1, v) for tag, (kind, v) in entries.items()
     )
-    return struct.pack("<2sHIH", b"II", 42, 8, len(entries)) + directory + struct.pack("<I", 0)
+    return struct.pack("<2sHIH", b"II", 42, 8, len(entries)) + directory + bytes(4)
 
 
 def encode(depth: NDArray[np.uint16]) -> pa.BinaryArray:

@@ -30,11 +30,7 @@ class TrainingStats:
 def compute_training_stats(
     index: EpisodeIndex, returns: ReturnConfig | None = None
 ) -> TrainingStats:
-    """Read and validate every episode once.
-
-    Raises:
-        DataError: a dataset is damaged, or holds values that are not finite.
-    """
+    """Read and validate every episode once."""
     config = returns or ReturnConfig()
     total, squares = np.zeros(spec.STATE_DIM), np.zeros(spec.STATE_DIM)
     found: list[NDArray[np.float32]] = []
@@ -44,7 +40,8 @@ def compute_training_stats(
         total += state.sum(0)
         squares += np.square(state).sum(0)
         valid = mc_valid(len(episode), episode.time_limit, config.steps, config.keep_truncated)
-        found.append(mc_return(episode.reward, config.gamma, config.steps)[valid])
+        reward = config.target_reward(episode.reward, episode.reward_terms)
+        found.append(mc_return(reward, config.gamma, config.steps)[valid])
     mean = total / index.num_frames
     variance = np.maximum(squares / index.num_frames - np.square(mean), 0.0)
     complete = np.bincount(index.dataset, weights=[len(returns) for returns in found])
@@ -58,10 +55,6 @@ def estimate_training_stats(
 
     Mean and standard deviation of the state are exact, from the statistics of each episode in
     `meta/episodes`. Returns are those of the sample.
-
-    Raises:
-        DataError: a dataset is damaged, or lacks these statistics.
-        EnvironmentFailure: the Hub cannot be reached.
     """
     found = compute_training_stats(sample, returns)
     stats = [reader.episode_stats(spec.STATE_KEY) for reader in index.readers]

@@ -106,7 +106,6 @@ class ShardWriter:
         return stats.aggregate(self._stats, counts), sum(counts)
 
     def discard(self) -> None:
-        """Close the open files after an error."""
         with suppress(OSError, pa.ArrowException):
             self._writer.close()
         with suppress(OSError):
@@ -130,7 +129,6 @@ class VersionContents:
 
     @property
     def frames(self) -> int:
-        """Frames of all episodes."""
         return sum(count for _, count in self.totals)
 
 
@@ -173,7 +171,6 @@ class VersionWriter:
 
     @property
     def episodes(self) -> int:
-        """Number of episodes so far."""
         return len(self._records)
 
     def add(self, encoded: EncodedEpisode) -> None:
@@ -220,7 +217,6 @@ class VersionWriter:
         return self._complete
 
     def discard(self) -> None:
-        """Remove the folder."""
         if self._shard is not None:
             self._shard.discard()
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -268,10 +264,6 @@ def publish_version(folder: Path, root: Path, replace: bool = False) -> None:
 
     If ``replace``, ``root`` is the previous version, which is moved to ``folder``. Otherwise
     ``root`` must be absent or an empty folder.
-
-    Raises:
-        UsageError: ``root`` is occupied.
-        EnvironmentFailure: ``root`` cannot be renamed.
     """
     try:
         if replace:
@@ -327,12 +319,7 @@ class DatasetWriter:
     def __init__(
         self, root: str | Path, provenance: Provenance, shard_episodes: int = schema.SHARD_EPISODES
     ) -> None:
-        """Create the temporary folder.
-
-        Raises:
-            UsageError: ``root`` exists and is not an empty folder, or cannot exist.
-            EnvironmentFailure: ``root`` is a mount point.
-        """
+        """Create the temporary folder; ``root`` must be absent or an empty folder."""
         self.root = resolve_root(root)
         require_new(self.root)
         make_parent(self.root)
@@ -341,12 +328,10 @@ class DatasetWriter:
 
     @property
     def num_episodes(self) -> int:
-        """Episodes added so far."""
         return self._version.episodes
 
     @property
     def num_frames(self) -> int:
-        """Frames added so far."""
         return self._version.frames
 
     def add(self, episode: Episode) -> None:
@@ -354,11 +339,7 @@ class DatasetWriter:
         self._version.add(encode(episode, f"episode {self.num_episodes}"))
 
     def finalize(self) -> Path:
-        """Complete the files, move the folder to ``root`` and return it.
-
-        Raises:
-            UsageError: no episode was added, or ``root`` was created by another program.
-        """
+        """Complete the files, move the folder to ``root`` and return it."""
         try:
             if self.num_episodes == 0:
                 raise UsageError(f"no episode was written to {self.root}")
@@ -370,7 +351,6 @@ class DatasetWriter:
         return self.root
 
     def discard(self) -> None:
-        """Remove everything written so far."""
         self._version.discard()
 
     def __enter__(self) -> Self:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, Literal
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from egovcp.errors import ArtifactError, DataError, EgovcpError, EnvironmentFailure, UsageError
-from egovcp.hub.retry import http_library
 
 if TYPE_CHECKING:
     from huggingface_hub.errors import HfHubHTTPError
@@ -20,7 +21,33 @@ _MISSING: Final[dict[RepoType, type[EgovcpError]]] = {"dataset": DataError, "mod
 
 
 class LostUpdate(EnvironmentFailure):
-    """The branch was changed by somebody else between the check and the commit."""
+    """The branch was changed by another client between the check and the commit."""
+
+
+class HubUnreachable(EnvironmentFailure):
+    """A request to the Hub failed and may succeed later."""
+
+    def __init__(self, message: str, pause_s: float = 0.0) -> None:
+        super().__init__(message)
+        self.pause_s = pause_s
+        """Pause that the Hub demands before the next request, s."""
+
+
+def unreachable(failure: str, pause_s: float = 0.0) -> HubUnreachable:
+    """The error of a request that failed like this."""
+    return HubUnreachable(
+        f"the Hub cannot be used: {failure}; check the network and HF_ENDPOINT, or try again later",
+        pause_s,
+    )
+
+
+@cache
+def http_library() -> Any:
+    """The HTTP library of the installed `huggingface_hub`: the module `httpx` or `httpx2`."""
+    from huggingface_hub.errors import HfHubHTTPError
+
+    bases = (base.__module__.partition(".")[0] for base in HfHubHTTPError.__mro__)
+    return importlib.import_module(next(name for name in bases if name.startswith("httpx")))
 
 
 @contextlib.contextmanager
@@ -99,12 +126,14 @@ def _translate(
                     "it is private and needs `hf auth login`; check the id"
                 )
             case HfHubHTTPError():
-                return _refusal(link, repo_id, writing, repo_type)
+                return _refusal(link, name, writing, repo_type)
             case OfflineModeIsEnabled():
                 return EnvironmentFailure(
                     f"HF_HUB_OFFLINE is set, so {repo_type} {name} cannot be requested from the "
                     "Hub; unset it"
                 )
+            case _ if isinstance(link, http_library().TransportError):
+                return unreachable(f"{describe(link)} for {repo_type} {name}")
             case HFValidationError():
                 return UsageError(f"{repo_id!r} is not the id of a {repo_type}: {_line(link)}")
     network = isinstance(error, (ConnectionError, TimeoutError, LocalEntryNotFoundError))
@@ -116,11 +145,9 @@ def _translate(
     )
 
 
-def _refusal(
-    error: HfHubHTTPError, repo_id: str, writing: bool, repo_type: RepoType
-) -> EgovcpError:
+def _refusal(error: HfHubHTTPError, name: str, writing: bool, repo_type: RepoType) -> EgovcpError:
     status, path = error.response.status_code, error.response.url.path
-    user = repo_id.split("/")[0]
+    repo_id, user = name.split("@")[0], name.split("/")[0]
     need = f"write access to {repo_type}s of {user}" if writing else f"read access to {repo_id}"
     if status == 401:
         return EnvironmentFailure(
@@ -133,7 +160,10 @@ def _refusal(
             "https://huggingface.co/settings/tokens and run `hf auth login`"
         )
     if status == 412:
-        return LostUpdate(f"somebody else has published to {repo_id} in the meantime")
+        return LostUpdate(
+            f"another client has published to {name} in the meantime; nothing was published; check "
+            "that version, then push again"
+        )
     message = _redacted(error.server_message or "").splitlines()
     reason = f": {message[0]}" if message else ""
     return EnvironmentFailure(
@@ -143,11 +173,15 @@ def _refusal(
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """The error and its causes."""
     link: BaseException | None = error
     while link is not None:
         yield link
         link = link.__cause__ or (None if link.__suppress_context__ else link.__context__)
+
+
+def describe(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__} ({lines[0]})" if lines else type(error).__name__
 
 
 def _line(error: BaseException) -> str:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.hub.errors import RepoType, hub_errors, hub_token
+from egovcp.hub.errors import HubUnreachable, RepoType, hub_token
 from egovcp.hub.publish import Content
-from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
+from egovcp.hub.retry import RetryPolicy, call_hub
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -53,12 +53,13 @@ def is_local_path(text: str) -> bool:
 
 def resolve(repo_id: str, revision: str, retry: RetryPolicy) -> str:
     """The commit SHA of a branch, a tag or a shortened SHA of a dataset."""
-    with hub_errors(repo_id, revision), retrying(retry):
-        from huggingface_hub import HfApi
+    from huggingface_hub import HfApi
 
-        commit = HfApi(token=hub_token()).dataset_info(repo_id, revision=revision or None).sha
-        assert commit is not None
-        return commit
+    api = HfApi(token=hub_token())
+    info = partial(api.dataset_info, repo_id, revision=revision or None)
+    commit: str | None = call_hub(info, retry, repo_id, revision).sha
+    assert commit is not None
+    return commit
 
 
 def snapshot(
@@ -73,11 +74,6 @@ def snapshot(
 
     If the Hub cannot be reached, a complete earlier download is used. Without ``patterns``, globs,
     all files are downloaded.
-
-    Raises:
-        DataError: there is no such dataset or revision.
-        ArtifactError: there is no such model or revision.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     from huggingface_hub import snapshot_download
 
@@ -90,8 +86,8 @@ def snapshot(
         allow_patterns=None if patterns is None else list(patterns),
     )
     try:
-        with hub_errors(repo_id, revision, repo_type=repo_type), retrying(retry):
-            return Path(download(token=hub_token()))
+        online = partial(download, token=hub_token())
+        return Path(call_hub(online, retry, repo_id, revision, repo_type=repo_type))
     except HubUnreachable as error:
         try:
             found = Path(download(local_files_only=True))
@@ -110,23 +106,7 @@ def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
         EnvironmentFailure: the Hub cannot be reached, refuses, or sends a file that differs from
             its list; that file is removed, so that the next call downloads it again.
     """
-    with hub_errors(repo_id, commit), retrying(retry):
-        from huggingface_hub import HfApi, snapshot_download
-
-        listing = _listing(HfApi(token=hub_token()), repo_id, commit)
-        for found in folder.rglob("*"):
-            relative = found.relative_to(folder)
-            foreign = relative.parts[0] != ".cache" and relative.as_posix() not in listing
-            if foreign and found.is_file():
-                found.unlink()
-        snapshot_download(
-            repo_id,
-            repo_type="dataset",
-            revision=commit,
-            local_dir=folder,
-            ignore_patterns=list(_FOREIGN),
-            max_workers=_WORKERS,
-        )
+    listing = call_hub(partial(_download, repo_id, commit, folder), retry, repo_id, commit)
     for name, file in listing.items():
         path = folder / name
         if not path.is_file() or not Content(path).matches(file):
@@ -136,6 +116,27 @@ def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
                 "downloaded again by the next attempt"
             )
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # LeRobot would download again
+
+
+def _download(repo_id: str, commit: str, folder: Path) -> dict[str, RepoFile]:
+    """Remove foreign files and download the others; returns the Hub's list of them."""
+    from huggingface_hub import HfApi, snapshot_download
+
+    listing = _listing(HfApi(token=hub_token()), repo_id, commit)
+    for found in folder.rglob("*"):
+        relative = found.relative_to(folder)
+        foreign = relative.parts[0] != ".cache" and relative.as_posix() not in listing
+        if foreign and found.is_file():
+            found.unlink()
+    snapshot_download(
+        repo_id,
+        repo_type="dataset",
+        revision=commit,
+        local_dir=folder,
+        ignore_patterns=list(_FOREIGN),
+        max_workers=_WORKERS,
+    )
+    return listing
 
 
 def _listing(api: HfApi, repo_id: str, commit: str) -> dict[str, RepoFile]:

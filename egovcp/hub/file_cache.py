@@ -11,9 +11,9 @@ from typing import Any, Final
 from tqdm import tqdm
 
 from egovcp.errors import DataError, EgovcpError
-from egovcp.hub.errors import hub_errors, hub_token
+from egovcp.hub.errors import hub_token
 from egovcp.hub.fetch import snapshot
-from egovcp.hub.retry import RetryPolicy, retrying
+from egovcp.hub.retry import RetryPolicy, call_hub
 
 #: Files that are prefetched at a time: one connection rarely uses the whole bandwidth.
 PREFETCH_FILES: Final = 3
@@ -37,10 +37,6 @@ class HubFileCache:
         """Resolve a revision to its commit and download those files that match ``patterns``.
 
         If the Hub cannot be reached, the commit of an earlier download is used.
-
-        Raises:
-            DataError: there is no such dataset or revision.
-            EnvironmentFailure: the Hub cannot be reached, or refuses.
         """
         self.repo_id = repo_id
         self.folder = snapshot(repo_id, revision, retry, cache_dir=cache_dir, patterns=patterns)
@@ -51,18 +47,11 @@ class HubFileCache:
         self._prefetching: dict[str, threading.Thread] = {}
 
     def has(self, name: str) -> bool:
-        """Whether a file has been downloaded."""
         if name not in self._present and (self.folder / name).exists():
             self._present.add(name)
         return name in self._present
 
     def get(self, name: str) -> Path:
-        """Path of a file, which is downloaded if need be.
-
-        Raises:
-            DataError: the commit has no such file.
-            EnvironmentFailure: the Hub cannot be reached, or refuses; or the disk is full.
-        """
         if not self.has(name):
             with self._locks.setdefault(name, threading.Lock()):
                 if not self.has(name):
@@ -90,10 +79,10 @@ class HubFileCache:
             del self._prefetching[name]
 
     def _download(self, name: str) -> None:
-        with hub_errors(self.repo_id, self.commit), retrying(self._retry):
-            from huggingface_hub import hf_hub_download
-            from huggingface_hub.errors import EntryNotFoundError
+        from huggingface_hub import hf_hub_download
+        from huggingface_hub.errors import EntryNotFoundError
 
+        def download() -> None:
             try:
                 hf_hub_download(
                     self.repo_id,
@@ -109,6 +98,8 @@ class HubFileCache:
                     f"{self.repo_id}@{self.commit} has no {name}; the dataset on the Hub is "
                     "incomplete"
                 ) from error
+
+        call_hub(download, self._retry, self.repo_id, self.commit)
 
 
 class _SilentBar(tqdm):  # type: ignore[misc]

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import time
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub.errors import LostUpdate, RepoType, hub_errors, hub_token
-from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
+from egovcp.files import sha256
+from egovcp.hub.errors import LostUpdate, RepoType, hub_token
+from egovcp.hub.retry import RetryPolicy, call_hub
 from egovcp.outputs import output_file
 
 if TYPE_CHECKING:
@@ -53,10 +52,9 @@ class Content:
     @cached_property
     def sha256(self) -> str:
         """The Hub's hash of a large file."""
-        if isinstance(self.source, bytes):
-            return hashlib.sha256(self.source).hexdigest()
-        with self.source.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        if isinstance(self.source, Path):
+            return sha256(self.source)
+        return hashlib.sha256(self.source).hexdigest()
 
     @cached_property
     def git_oid(self) -> str:
@@ -93,11 +91,6 @@ class Publication:
     """Tag of this commit, which never moves."""
     repo_type: RepoType = "dataset"
 
-    @property
-    def errors(self) -> AbstractContextManager[None]:
-        """`hub_errors` for requests to this repository."""
-        return hub_errors(self.repo_id, self.branch, writing=True, repo_type=self.repo_type)
-
 
 @dataclass(frozen=True)
 class Published:
@@ -112,65 +105,67 @@ def publish(publication: Publication, retry: RetryPolicy) -> Published:
     """Make the branch hold the contents, then set the tags.
 
     A repeated call completes an interrupted one: large files that were uploaded are reused, and
-    nothing is committed if nothing differs.
-
-    Raises:
-        UsageError: a private repository was requested and the id has a public one, or the tag
-            belongs to another commit.
-        LostUpdate: somebody else has changed the branch in the meantime.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    nothing is committed if nothing differs. Raises `LostUpdate` if another client changes the
+    branch in the meantime.
     """
-    with publication.errors, retrying(retry):
-        publisher = _Publisher(publication, hub_token())
-        publisher.prepare()
-        seen, tags = publisher.read_branch(publication.branch), publisher.tags()
-        publisher.require_free_tag(tags, seen)
-        commit = publisher.commit(seen, retry) if publisher.operations(seen) else seen.head
-        for tag in filter(None, (publication.moving_tag, publication.tag)):
-            publisher.set_tag(tag, commit, tags.get(tag))
-    return Published(commit, commit != seen.head)
+    publisher = _Publisher(publication, hub_token())
+    return publisher.call(publisher.publish, retry)
 
 
 def ensure_repository(publication: Publication, retry: RetryPolicy) -> None:
     """Create the repository and the branch, or check that they can be written to.
 
     Call it before a long computation whose result is to be published.
-
-    Raises:
-        UsageError: the id is not valid, or has a public repository and a private one is requested.
-        EnvironmentFailure: not logged in, the Hub refuses, or cannot be reached.
     """
-    with publication.errors, retrying(retry):
-        if (token := hub_token()) is None:
-            raise EnvironmentFailure(
-                f"not logged in to the Hub, so {publication.repo_id} could not be published; run "
-                "`hf auth login`, or set HF_TOKEN"
-            )
-        _Publisher(publication, token).prepare()
+    if (token := hub_token()) is None:
+        raise EnvironmentFailure(
+            f"not logged in to the Hub, so {publication.repo_id} could not be published; run "
+            "`hf auth login`, or set HF_TOKEN"
+        )
+    publisher = _Publisher(publication, token)
+    publisher.call(publisher.prepare, retry)
 
 
 class _Branch(NamedTuple):
-    """State of a branch."""
-
     head: str
     files: Mapping[str, RepoFile]
 
 
 class _Publisher:
-    """The requests that publish a `Publication`."""
-
     def __init__(self, publication: Publication, token: str | None) -> None:
         from huggingface_hub import HfApi
 
         self._api = HfApi(token=token)
         self._wanted = publication
+        self._first: _Branch | None = None  # before the first attempt
         self._repo: dict[str, Any] = {
             "repo_id": publication.repo_id,
             "repo_type": publication.repo_type,
         }
 
+    def call[R](self, method: Callable[[], R], retry: RetryPolicy) -> R:
+        wanted = self._wanted
+        return call_hub(method, retry, wanted.repo_id, wanted.branch, True, wanted.repo_type)
+
+    def publish(self) -> Published:
+        wanted = self._wanted
+        self.prepare()
+        seen, tags = self.read_branch(wanted.branch), self.tags()
+        self._first = self._first or seen
+        self.require_free_tag(tags, seen)
+        commit = seen.head
+        if self.operations(seen):
+            if seen.head != self._first.head:
+                raise LostUpdate(
+                    f"another client has published to {wanted.repo_id}@{wanted.branch} in the "
+                    "meantime; nothing was published; check that version, then push again"
+                )
+            commit = self.commit(seen)
+        for tag in filter(None, (wanted.moving_tag, wanted.tag)):
+            self.set_tag(tag, commit, tags.get(tag))
+        return Published(commit, commit != self._first.head)
+
     def prepare(self) -> None:
-        """Create the repository and the branch if they do not exist."""
         private, branch = self._wanted.private, self._wanted.branch
         self._api.create_repo(**self._repo, private=private or None, exist_ok=True)
         if private and not self._api.repo_info(**self._repo).private:
@@ -191,7 +186,6 @@ class _Publisher:
         return _Branch(head, {entry.path: entry for entry in tree if isinstance(entry, RepoFile)})
 
     def tags(self) -> dict[str, str]:
-        """Tag -> commit."""
         refs = self._api.list_repo_refs(**self._repo)
         return {tag.name: tag.target_commit for tag in refs.tags}
 
@@ -223,7 +217,7 @@ class _Publisher:
             *(CommitOperationAdd(path, wanted[path].source) for path in changed),
         ]
 
-    def commit(self, seen: _Branch, retry: RetryPolicy) -> str:
+    def commit(self, seen: _Branch) -> str:
         """Upload, then commit on top of ``seen``; returns the SHA of the commit."""
         from huggingface_hub import CommitOperationAdd
 
@@ -232,40 +226,19 @@ class _Publisher:
         self._api.preupload_lfs_files(
             **self._repo, additions=additions, revision=branch, free_memory=False
         )
-        name = f"{self._wanted.repo_id}@{branch}"
-        for attempt in range(1, retry.attempts + 1):
-            try:
-                with self._wanted.errors:
-                    made = self._api.create_commit(
-                        **self._repo,
-                        operations=operations,
-                        commit_message=self._wanted.message,
-                        revision=branch,
-                        parent_commit=seen.head,
-                    )
-            except (HubUnreachable, LostUpdate) as error:
-                now = self.read_branch(branch)
-                if not self.operations(now):
-                    return now.head  # the commit was made, only the answer was lost
-                if now.head != seen.head:
-                    raise LostUpdate(
-                        f"somebody else has published to {name} in the meantime: it was "
-                        f"{seen.head} and is now {now.head}; nothing was published; check that "
-                        "version, then push again"
-                    ) from error
-                if attempt == retry.attempts:
-                    raise
-                time.sleep(retry.pause(attempt))
-            else:
-                left = self.operations(self.read_branch(made.oid))
-                if left:
-                    raise EnvironmentFailure(
-                        f"{name} differs from what was sent in {left[0].path_in_repo}; is there "
-                        "a .gitignore in the repository?"
-                    )
-                oid: str = made.oid
-                return oid
-        raise AssertionError("unreachable")
+        made: str = self._api.create_commit(
+            **self._repo,
+            operations=operations,
+            commit_message=self._wanted.message,
+            revision=branch,
+            parent_commit=seen.head,
+        ).oid
+        if left := self.operations(self.read_branch(made)):
+            raise EnvironmentFailure(
+                f"{self._wanted.repo_id}@{branch} differs from what was sent in "
+                f"{left[0].path_in_repo}; is there a .gitignore in the repository?"
+            )
+        return made
 
     def set_tag(self, tag: str, commit: str, at: str | None) -> None:
         """Set a tag, as LeRobot does: the Hub cannot move one, only remove and create it."""

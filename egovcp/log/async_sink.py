@@ -6,9 +6,9 @@ A thread would not do: encoding a tick holds the interpreter lock for millisecon
 hangs would block the exit. The loop only pickles the tick and writes to a non-blocking pipe
 (`benchmarks/tick_logging.py` measures both).
 
-A tick that does not fit into the queue is dropped and counted, also while the disk is full. Any
-other failure of the writer (a closed viewer, a broken disk, a killed process) is reported once, as
-one line; the sink then ignores further ticks and the run continues.
+A tick that does not fit into the queue is dropped and counted. A failure of the writer (a closed
+viewer, a full disk, a killed process) is reported once, as one line; the sink then ignores further
+ticks and the run continues.
 """
 
 from __future__ import annotations
@@ -21,24 +21,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.pipe import (
-    Close,
-    Closed,
-    Failed,
-    Inbox,
-    Open,
-    Opened,
-    Outbox,
-    Resumed,
-    Waiting,
-    WriterReport,
-    Written,
-    enlarge,
-    pack,
-)
+from egovcp.log.pipe import Outbox, WriterReport, enlarge, pack
 from egovcp.log.sink import Sink
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.terminal import echo
@@ -50,7 +37,6 @@ _KILL_TIMEOUT_S: Final = 1.0  # a process that waits for a disk does not end on 
 
 
 def warn_on_stderr(line: str) -> None:
-    """Print ``line`` to stderr."""
     echo(line, error=True)
 
 
@@ -61,10 +47,9 @@ class AsyncSink:
     that a run does not start with a log that cannot be written.
 
     Args:
-        sink: the sink to open and write; must be picklable before it is opened.
+        sink: must be picklable before it is opened.
         name: its name in messages, such as ``rollout-0.mcap``.
-        lossless: block instead of dropping ticks, for a simulation in lock-step. A full disk is
-            then an error.
+        lossless: block instead of dropping ticks, for a simulation in lock-step.
         queue_ticks: capacity of the queue in this process.
         close_timeout_s: how long `close` waits for queued ticks.
         warn: receives each message, one line.
@@ -86,23 +71,15 @@ class AsyncSink:
         self._process: _WriterProcess | None = None
         self._opened = self._closed = False
         self._accepted = self._written = self._gap = 0
-        self._dropped = 0
-        self._failure: Exception | None = None
-
-    @property
-    def dropped(self) -> int:
+        self.dropped = 0
         """Number of ticks dropped because the queue was full or the sink had failed."""
-        return self._dropped
+        self.failure: Exception | None = None
+        """The error of the sink; None while it works."""
 
     @property
     def lost(self) -> int:
         """Number of accepted ticks without a confirmation that they were written."""
         return self._accepted - self._written
-
-    @property
-    def failure(self) -> Exception | None:
-        """The error of the sink; None while it works."""
-        return self._failure
 
     @property
     def pid(self) -> int:
@@ -117,19 +94,14 @@ class AsyncSink:
             self._process = _WriterProcess()
 
     def open(self, info: RunInfo) -> None:
-        """Open the sink in its process, and wait for it.
-
-        Raises:
-            EgovcpError, OSError: the error of the sink.
-            EnvironmentFailure: the process did not start in time.
-        """
+        """Open the sink in its process, and wait for it; raises its error."""
         self.start()
         assert self._process is not None
-        self._process.outbox.put(pack(Open(self._sink, info, waits=not self._lossless)))
+        self._process.outbox.put(pack((self._sink, info)))
         self._await(lambda: self._opened, START_TIMEOUT_S)
         if not self._opened:
             self.close()
-            raise self._failure or EnvironmentFailure(
+            raise self.failure or EnvironmentFailure(
                 f"{self.name}: its writer process was not ready in {START_TIMEOUT_S:.0f} s"
             )
 
@@ -138,14 +110,13 @@ class AsyncSink:
         self.write_packed(tick, pack(tick))
 
     def write_packed(self, tick: Tick, packed: bytes) -> None:
-        """`write` for a tick that is already serialised."""
         process = self._process
         assert process is not None, "open the sink before writing to it"
         self._pump()
         if self._lossless:
             self._await(lambda: len(process.outbox) < self._capacity, float("inf"))
-        if self._failure is not None or len(process.outbox) >= self._capacity:
-            self._dropped += 1
+        if self.failure is not None or len(process.outbox) >= self._capacity:
+            self.dropped += 1
             self._gap += 1
             return
         process.outbox.put(pack(self._with_gap(tick)) if self._gap else packed)
@@ -156,8 +127,8 @@ class AsyncSink:
         """Close the sink, waiting at most ``close_timeout_s``; report lost ticks."""
         if self._process is None:
             return
-        if self._opened and self._failure is None:
-            self._process.outbox.put(pack(Close()))
+        if self._opened and self.failure is None:
+            self._process.outbox.put(pack(None))
             self._await(lambda: self._closed, self._close_timeout_s)
         self._process.kill()
         self._process = None
@@ -172,48 +143,42 @@ class AsyncSink:
         """Pump until ``ready``, a failure, or the timeout."""
         assert self._process is not None
         end = time.monotonic() + timeout_s
-        while self._failure is None and not ready() and (left := end - time.monotonic()) > 0:
+        while self.failure is None and not ready() and (left := end - time.monotonic()) > 0:
             self._process.wait(left)
             self._pump()
 
     def _pump(self) -> None:
         """Exchange bytes with the process without blocking."""
         assert self._process is not None
-        if self._failure is not None or self._closed:
+        if self.failure is not None or self._closed:
             return
         try:
             for report in self._process.exchange():
                 self._handle(report)
         except (EOFError, BrokenPipeError):
-            if not self._closed and self._failure is None:
+            if not self._closed and self.failure is None:
                 self._fail(EnvironmentFailure(self._process.exit_text()))
 
     def _handle(self, report: WriterReport) -> None:
         match report:
-            case Opened():
-                self._opened = True
-            case Written():
-                self._written = report.count
-            case Waiting():
-                self._warn(f"{self.name}: {_text(report.error)}; ticks wait until there is room")
-            case Resumed():
-                self._warn(f"{self.name}: there is room again")
-            case Closed():
+            case None:
                 self._closed = True
-            case Failed():
-                self._fail(report.error)
+            case int():
+                self._opened, self._written = True, report
+            case Exception():
+                self._fail(report)
 
     def _fail(self, error: Exception) -> None:
-        self._failure = error
+        self.failure = error
         if self._opened:  # otherwise `open` raises it
-            self._warn(f"{self.name}: {_text(error)}; the run goes on without this log")
+            self._warn(f"{self.name}: {_text(error)}; the run continues without this log")
 
     def _report_losses(self) -> None:
-        if self._opened and (self._dropped or self.lost):
-            total = self._accepted + self._dropped
+        if self._opened and (self.dropped or self.lost):
+            total = self._accepted + self.dropped
             unfinished = "" if self._closed else "; it is not finished"
             self._warn(
-                f"{self.name}: {self._dropped} of {total} ticks were dropped, "
+                f"{self.name}: {self.dropped} of {total} ticks were dropped, "
                 f"{self.lost} more may be missing at its end{unfinished}"
             )
         elif self._opened and not self._closed:
@@ -254,10 +219,10 @@ class _WriterProcess:
 
     def __init__(self) -> None:
         theirs, self._commands = os.pipe()
-        self._reports, theirs_too = os.pipe()
+        reports, theirs_too = os.pipe()
         enlarge(self._commands)
         self.outbox = Outbox(self._commands)
-        self._inbox = Inbox(self._reports)
+        self._reports = Connection(reports, writable=False)
         command = [sys.executable, "-m", "egovcp.log.writer_process", str(theirs), str(theirs_too)]
         modules = os.pathsep.join(path for path in sys.path if path)
         self._process = subprocess.Popen(
@@ -286,14 +251,14 @@ class _WriterProcess:
             self.outbox.pump()
         except BrokenPipeError as error:
             broken = error
-        yield from self._inbox.ready()  # includes the last reports of a process that has ended
+        while self._reports.poll():  # includes the last reports of a process that has ended
+            yield self._reports.recv()
         if broken is not None:
             raise broken
 
     def wait(self, seconds: float) -> None:
-        """Wait until a pipe is readable or writable, at most ``seconds``."""
         poll = select.poll()
-        poll.register(self._reports, select.POLLIN)
+        poll.register(self._reports.fileno(), select.POLLIN)
         if len(self.outbox):
             poll.register(self._commands, select.POLLOUT)
         poll.poll(min(seconds, 1.0) * 1e3)
@@ -312,8 +277,8 @@ class _WriterProcess:
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_KILL_TIMEOUT_S)
-        for descriptor in (self._commands, self._reports):
-            os.close(descriptor)
+        os.close(self._commands)
+        self._reports.close()
 
 
 def _text(error: Exception) -> str:

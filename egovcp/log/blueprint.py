@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final
 
 import rerun.blueprint as rrb
@@ -14,20 +13,22 @@ _FRONT: Final = (1.9, 1.5, 1.2)  # shows both hands and approaching objects
 _SIDE: Final = (0.3, 3.1, 1.6)  # a surface in front of the robot does not hide it
 
 
-def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
+def blueprint() -> rrb.Blueprint:
     """Layout for a run with a planner.
 
     Tab ``plan``: left, the 3D view above value maps and events; right, depth images above curves.
     Tab ``robot``: motors, connection and state of the runner.
-
-    Args:
-        imagined: horizons of the imagined depth images, ticks ahead; empty: no such images.
     """
-    images = [*_images(imagined)]
+    decoded = rrb.Spatial2DView(name="reconstructed", origin=paths.RECONSTRUCTED)
+    imagined = [
+        rrb.Spatial2DView(name=f"imagined +{k}", origin=f"{paths.IMAGINED}/{i}")
+        for i, k in enumerate(paths.IMAGINED_TICKS)
+    ]
     plan = rrb.Horizontal(
         rrb.Vertical(_scene(_FRONT), _below_scene(), row_shares=[5, 2]),
         rrb.Vertical(
-            *images,
+            rrb.Horizontal(_depth_view(), decoded),
+            rrb.Horizontal(*imagined),
             _curves(
                 {
                     "value of the plan": f"{paths.PLAN}/value",
@@ -35,7 +36,7 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
                 }
             ),
             _curves({"reward": paths.REWARD, "timing (ms)": paths.TIMING}),
-            row_shares=[3.0, *[2.0] * (len(images) + 1)],
+            row_shares=[3.0, 2.0, 2.0, 2.0],
         ),
         column_shares=[3, 2],
         name="plan",
@@ -99,25 +100,22 @@ def _curves(origins: dict[str, str], name: str | None = None) -> rrb.Container:
 
 
 def _robot_tab() -> rrb.Container:
-    last = _curves(
-        {
-            "connection, image age, mode machine": paths.LINK,
-            "state of the runner": paths.RUNNER,
-        }
-    )
+    link = {
+        "connection, image age, mode machine": paths.LINK,
+        "state of the runner": paths.RUNNER,
+    }
     temperature = {
         "motor temperature (deg C)": paths.MOTOR_TEMPERATURE,
         "motor torque (N m)": paths.MOTOR_TORQUE,
     }
     faults = {
         "motor faults (status bits)": paths.MOTOR_FAULTS,
-        "packets lost by motors": paths.MOTOR_LOST,
     }
     events = rrb.TextLogView(name="events", origin=paths.EVENTS)
     return rrb.Vertical(
         _curves(temperature),
         _curves(faults),
-        rrb.Horizontal(last, events, column_shares=[2, 1]),
+        rrb.Horizontal(_curves(link), events, column_shares=[2, 1]),
         name="robot",
     )
 
@@ -153,14 +151,3 @@ def _scene(eye: tuple[float, float, float]) -> rrb.View:
 
 def _depth_view() -> rrb.View:
     return rrb.Spatial2DView(name="depth seen", origin=paths.CAMERA, contents=[paths.DEPTH])
-
-
-def _images(imagined: tuple[int, ...]) -> Iterator[rrb.Container]:
-    decoded = rrb.Spatial2DView(name="reconstructed", origin=paths.RECONSTRUCTED)
-    yield rrb.Horizontal(_depth_view(), decoded)
-    if imagined:
-        views = [
-            rrb.Spatial2DView(name=f"imagined +{k}", origin=f"{paths.IMAGINED}/{i}")
-            for i, k in enumerate(imagined)
-        ]
-        yield rrb.Horizontal(*views)

@@ -13,11 +13,11 @@ import os
 import time
 import zlib
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, Final, cast
+from typing import IO, Final
 
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
@@ -55,70 +55,6 @@ def _checksum(metadata: Mapping[str, str]) -> str:
     return f"{zlib.crc32(json.dumps(dict(metadata), sort_keys=True).encode()):08x}"
 
 
-class AppendFile:
-    """A file that buffers writes and appends them at `flush`, completely or not at all.
-
-    `flush` calls fsync at most every ``sync_period_s``, since that may take long. If the disk is
-    full, the file is truncated to its last complete flush, the data stays in memory, and the next
-    `flush` tries again.
-
-    Args:
-        path: the file to create; raises `FileExistsError` if it exists.
-        sync_period_s: seconds between two calls of fsync; infinity: only on `close`.
-    """
-
-    def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
-        self._file = path.open("xb", buffering=0)
-        self._pending = bytearray()
-        self._size = 0
-        self._period = sync_period_s
-        self._synced = time.monotonic()
-        _sync_folder(path.absolute().parent)
-
-    def write(self, data: bytes) -> int:
-        """Buffer ``data``."""
-        self._pending += data
-        return len(data)
-
-    def tell(self) -> int:
-        """Size of the file and of the buffer."""
-        return self._size + len(self._pending)
-
-    def flush(self) -> None:
-        """Append the buffer; on OSError the file is unchanged."""
-        try:
-            _write_all(self._file.fileno(), self._pending)
-        except OSError:
-            os.ftruncate(self._file.fileno(), self._size)
-            os.lseek(self._file.fileno(), self._size, os.SEEK_SET)
-            raise
-        self._size += len(self._pending)
-        self._pending = bytearray()
-        if time.monotonic() - self._synced >= self._period:
-            self._sync()
-
-    def close(self) -> None:
-        try:
-            self.flush()
-            self._sync()
-        finally:
-            self._file.close()
-
-    def abandon(self) -> None:
-        """Close the file without the buffer."""
-        self._file.close()
-
-    def _sync(self) -> None:
-        os.fsync(self._file.fileno())
-        self._synced = time.monotonic()
-
-
-def _write_all(descriptor: int, data: bytearray) -> None:
-    rest = memoryview(data)
-    while rest:
-        rest = rest[os.write(descriptor, rest) :]
-
-
 def _sync_folder(folder: Path) -> None:
     """Make the name of a new file durable."""
     descriptor = os.open(folder, os.O_RDONLY)
@@ -140,25 +76,19 @@ class RecordedTopic:
 class McapFile:
     """A new recording, written message by message.
 
-    After an OSError (a full disk) the file ends with the last successful flush and has no index, as
-    after a kill. Data that did not fit stays in memory; a later successful `flush` writes it.
+    After an OSError (a full disk) the file ends with a torn tick and has no index, as after a kill.
     """
 
-    def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._sync_period_s = sync_period_s
-        self._file: AppendFile | None = None
+        self._file: IO[bytes] | None = None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
 
     def open(self, metadata: Mapping[str, str]) -> None:
-        """Create the file and write the metadata record.
-
-        Raises:
-            EnvironmentFailure: the file exists, or its folder does not.
-        """
+        """Create the file and write the metadata record."""
         try:
-            self._file = AppendFile(self._path, self._sync_period_s)
+            self._file = self._path.open("xb")
         except FileExistsError as error:
             raise EnvironmentFailure(
                 f"{self._path} exists already; recordings are never overwritten: choose another"
@@ -167,23 +97,22 @@ class McapFile:
             raise EnvironmentFailure(f"{self._path} is in a folder that does not exist") from (
                 error
             )
+        self._metadata = with_checksum(metadata)
+        self._synced = time.monotonic()
         try:
-            self._begin(self._file, with_checksum(metadata))
+            self._writer = Writer(
+                self._file,
+                chunk_size=_CHUNK_BYTES,
+                compression=CompressionType.ZSTD,
+                enable_data_crcs=True,
+            )
+            self._writer.start(profile=Profile.ROS2, library="egovcp")
+            self._writer.add_metadata(METADATA_NAME, self._metadata)
+            self.flush()
+            _sync_folder(self._path.absolute().parent)
         except BaseException:
             self.discard()
             raise
-
-    def _begin(self, file: AppendFile, metadata: dict[str, str]) -> None:
-        self._writer = Writer(
-            cast(IO[bytes], file),
-            chunk_size=_CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-            enable_data_crcs=True,
-        )
-        self._writer.start(profile=Profile.ROS2, library="egovcp")
-        self._metadata = metadata
-        self._writer.add_metadata(METADATA_NAME, metadata)
-        self.flush()
 
     def add(self, topic: RecordedTopic, index: int, time_ns: int, data: bytes) -> None:
         self._writer.add_message(
@@ -195,28 +124,32 @@ class McapFile:
         )
 
     def flush(self) -> None:
-        """Write everything to the file; raises OSError if the disk is full."""
+        """Write everything to the file, and to the disk if the last time is `SYNC_PERIOD_S` ago."""
+        assert self._file is not None, "open the file before writing to it"
         self._writer.flush()  # type: ignore[no-untyped-call]
+        if time.monotonic() - self._synced >= SYNC_PERIOD_S:
+            os.fsync(self._file.fileno())
+            self._synced = time.monotonic()
 
     def close(self) -> None:
-        """Write the index and close the file; further calls do nothing.
-
-        Raises:
-            OSError: the disk is full; the file is as after a kill.
-        """
+        """Write the index and close the file; further calls do nothing."""
         file, self._file = self._file, None
         if file is None:
             return
-        with closing(file):
-            self.flush()  # first: an almost full disk may take the ticks but not the index
+        with file:
+            # first: an almost full disk may take the ticks but not the index
+            self._writer.flush()  # type: ignore[no-untyped-call]
             self._writer.add_metadata(METADATA_NAME, self._metadata)  # a second copy
             self._writer.finish()  # type: ignore[no-untyped-call]
+            file.flush()
+            os.fsync(file.fileno())
 
     def discard(self) -> None:
         file, self._file = self._file, None
-        if file is not None:
-            file.abandon()
         self._path.unlink(missing_ok=True)
+        if file is not None:
+            with suppress(OSError):
+                file.close()
 
     def _channel(self, topic: RecordedTopic) -> int:
         if topic.topic not in self._channels:
@@ -236,15 +169,10 @@ class McapFile:
 
 
 class McapSink:
-    """Writes ticks to a new `McapFile`.
+    """Writes ticks to a new `McapFile`."""
 
-    Args:
-        path: the file to create.
-        sync_period_s: seconds between two calls of fsync.
-    """
-
-    def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
-        self._file = McapFile(path, sync_period_s)
+    def __init__(self, path: Path) -> None:
+        self._file = McapFile(path)
 
     def open(self, info: RunInfo) -> None:
         """Create the file and write the metadata record."""
@@ -252,17 +180,9 @@ class McapSink:
         self._view = info.camera
 
     def write(self, tick: Tick) -> None:
-        """Write the messages of the tick and flush the file.
-
-        Raises:
-            OSError: the disk is full or broken.
-        """
+        """Write the messages of the tick and flush the file."""
         for topic, message in encode_tick(tick, self._view).items():
             self._file.add(_recorded_topic(topic), tick.index, tick.time_ns, message)
-        self._file.flush()
-
-    def retry(self) -> None:
-        """Write the tick that did not fit; raises OSError if the disk is still full."""
         self._file.flush()
 
     def close(self) -> None:

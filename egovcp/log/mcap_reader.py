@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from mcap.records import Channel, McapRecord, Message, Metadata, Schema
+from mcap.records import Channel, Message, Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from egovcp.errors import DataError
 from egovcp.files import UnsafeFileError, open_regular
 from egovcp.log.mcap import METADATA_NAME, RecordedTopic, checksum_matches, without_checksum
-from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
+from egovcp.log.mcap_records import MAGIC, RecordFile
 from egovcp.log.messages import Topic, decode_mode, decode_tick, motor_readings
 from egovcp.log.tick import MotorReadings, RunInfo, Tick
 from egovcp.rate import NS_PER_S
@@ -30,9 +32,8 @@ from egovcp.rate import NS_PER_S
 ROW_TOPICS: Final = frozenset(
     {Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD, Topic.MODE, Topic.LOG}
 )
-#: Topics of every tick.
-REQUIRED_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
 _MOTOR_TOPICS: Final = frozenset({Topic.JOINTS, Topic.MOTOR_TEMPERATURE, Topic.MOTOR_STATUS})
+_SHOWN_LOSSES: Final = 5
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,7 @@ class Recording:
 
 
 def read_recording(path: Path, damaged_ok: bool = True) -> Recording:
-    """Read all readable ticks of ``path`` into memory.
-
-    Raises:
-        DataError: not an MCAP file of egovcp, or damaged without ``damaged_ok``.
-    """
+    """Read all readable ticks of ``path``; raises `DataError` for damage without ``damaged_ok``."""
     reader = RecordingReader(path)
     ticks = [raw.tick() for raw in reader.raw_ticks()]
     if not damaged_ok:
@@ -60,87 +57,63 @@ def read_recording(path: Path, damaged_ok: bool = True) -> Recording:
 
 @dataclass
 class RawTick:
-    """The messages of one tick, not decoded."""
+    """The messages of one tick, not decoded. Its methods raise `DataError` for damaged messages."""
 
     index: int
     time_ns: int
     topics: Mapping[str, RecordedTopic]
     decoders: DecoderFactory
     """Decoders of this file; it caches them by schema id."""
-    messages: dict[str, Message] = field(default_factory=dict)
+    messages: dict[str, Message]
 
     def tick(self, topics: Collection[str] | None = None) -> Tick:
-        """Decode the tick, or only the messages on ``topics``.
+        """Decode the tick, or only the messages on ``topics``; a required topic must be there."""
+        with self._errors():
+            return decode_tick(self.index, self.time_ns, self._decode(topics or self.messages))
 
-        Raises:
-            DataError: it lacks a required topic, or a message is damaged.
-        """
-        wanted = self.messages.keys() if topics is None else self.messages.keys() & set(topics)
+    def text(self, topic: str) -> str:
+        """Text of the log message on ``topic``; empty without one."""
+        return "".join(str(message.msg) for message in self._decode({topic}).values())
+
+    def mode(self) -> str:
+        return decode_mode(self._decode({Topic.MODE}).get(Topic.MODE))
+
+    def motors(self) -> MotorReadings | None:
+        with self._errors():
+            return motor_readings(self._decode(_MOTOR_TOPICS))
+
+    def _decode(self, topics: Collection[str]) -> dict[str, Any]:
+        """Topic -> decoded message, for those of ``topics`` that the tick has."""
+        decoded = {}
+        for name in self.messages.keys() & set(topics):
+            known = self.topics[name]
+            decode = self.decoders.decoder_for(known.encoding, known.schema)
+            if decode is None:
+                kind = f"{known.schema.name} in {known.encoding}"
+                raise DataError(f"topic {name} is {kind}, not ROS 2")
+            with self._errors():
+                decoded[name] = decode(self.messages[name].data)
+        return decoded
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
         try:
-            return decode_tick(
-                self.index, self.time_ns, {name: self._decode(name) for name in wanted}
-            )
+            yield
         except KeyError as error:
             raise DataError(f"tick {self.index} has nothing on topic {error.args[0]}") from error
         except (struct.error, ValueError, IndexError, AttributeError) as error:
             raise DataError(f"tick {self.index} is damaged: {error}") from error
 
-    def text(self, topic: str) -> str:
-        """Text of the log message on ``topic``; empty without one."""
-        return str(self._decode(topic).msg) if topic in self.messages else ""
 
-    def mode(self) -> str:
-        """`Tick.mode`.
+class Loss(NamedTuple):
+    """Consecutive ticks made unreadable by damage."""
 
-        Raises:
-            DataError: the message is damaged.
-        """
-        return decode_mode(self._decoded({Topic.MODE}).get(Topic.MODE))
-
-    def motors(self) -> MotorReadings | None:
-        """`Tick.motors`.
-
-        Raises:
-            DataError: a message is damaged.
-        """
-        try:
-            return motor_readings(self._decoded(_MOTOR_TOPICS))
-        except (ValueError, IndexError, AttributeError) as error:
-            raise DataError(f"tick {self.index} is damaged: {error}") from error
-
-    def _decoded(self, topics: Collection[str]) -> dict[str, Any]:
-        """Topic -> decoded message, for those of ``topics`` that the tick has."""
-        try:
-            return {name: self._decode(name) for name in self.messages.keys() & set(topics)}
-        except (struct.error, ValueError, IndexError, AttributeError) as error:
-            raise DataError(f"tick {self.index} is damaged: {error}") from error
-
-    def _decode(self, topic: str) -> Any:
-        known = self.topics[topic]
-        decode = self.decoders.decoder_for(known.encoding, known.schema)
-        if decode is None:
-            raise DataError(f"topic {topic} is {known.schema.name} in {known.encoding}, not ROS 2")
-        return decode(self.messages[topic].data)
-
-
-@dataclass(frozen=True)
-class Loss:
-    """Ticks made unreadable by damage."""
-
-    after: tuple[int, int] | None
-    """Index and time, ns, of the last readable tick before it; None: there is none."""
-    before: tuple[int, int] | None
-    """Index and time, ns, of the first readable tick after it; None: there is none."""
-    ticks: int | None
-    """How many ticks were lost; None: unknown."""
+    ticks: int
+    place: str
 
 
 class RecordingReader:
-    """Iterates over a recording in constant memory; skips damaged parts (see `mcap_records`).
-
-    Raises:
-        DataError: not an MCAP file of egovcp.
-    """
+    """Iterates over a recording in constant memory; skips damaged parts (see `mcap_records`)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -152,44 +125,54 @@ class RecordingReader:
         """Losses that `raw_ticks` has found, without those at the end of a torn file."""
         self.topics: dict[str, RecordedTopic] = {}
         """The topics found so far."""
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        summary = self._file.summary
+        self._schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
+        self._topic_of: dict[int, str] = {}  # by channel id
+        for channel in summary.channels.values() if summary else ():
+            self._add_channel(channel)
         self._decoders = DecoderFactory()
-        self._metadata_damaged = False
-        self._start_ns = 0
         self.metadata = self._read_metadata()
         """The record ``egovcp``, without its checksum."""
-        self.info = self._info()
+        try:
+            self.info = RunInfo.from_metadata(self.metadata)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
+            raise DataError(f"{self._path}: {problem}") from error
 
     @property
     def torn(self) -> bool:
-        """Whether the end of the file is missing, as after a kill."""
+        """Whether `raw_ticks` found that the end of the file is missing, as after a kill."""
         return self._file.torn
 
     @property
     def damaged(self) -> bool:
         """Whether `raw_ticks` has found damage, other than a missing end."""
-        return self._file.damaged or self._metadata_damaged
+        return self._file.damaged
 
     def raw_ticks(self) -> Iterator[RawTick]:
         """The readable ticks in order."""
         self.losses, self.complete = [], False
-        count, last, open_loss = 0, None, False
-        for raw in self._grouped():
-            if isinstance(raw, Damage):
-                open_loss = True
+        last, lost, start_ns = None, 0, 0
+        for index, group in groupby(self._messages(), lambda m: m.sequence if m else None):
+            if index is None:
+                lost += len(list(group))
                 continue
-            if self._file.damage and not raw.messages.keys() >= REQUIRED_TOPICS:
-                open_loss = True  # some of its chunks were damaged
-                continue
-            if open_loss:
-                self._add_loss(last, raw)
+            messages = [message for message in group if message]
+            raw = RawTick(
+                index,
+                messages[0].log_time,
+                self.topics,
+                self._decoders,
+                {self._topic_of[message.channel_id]: message for message in messages},
+            )
             if last is None:
-                self._start_ns = raw.time_ns - raw.index * NS_PER_S // self.info.fps
-            last, open_loss, count = raw, False, count + 1
+                start_ns = raw.time_ns - raw.index * NS_PER_S // self.info.fps
+            if lost:
+                self.losses.append(_loss(lost, last, raw, start_ns))
+            last, lost = raw, 0
             yield raw
-        if open_loss:
-            self._add_final_loss(last, count)
+        if lost:
+            self.losses.append(_loss(lost, last, None, start_ns))
         self.complete = not self.torn and not self.damaged
 
     def require_undamaged(self) -> None:
@@ -202,128 +185,55 @@ class RecordingReader:
 
     def loss_text(self) -> str:
         """Number and place of lost ticks, or "no tick is lost"."""
-        lost = [loss for loss in self.losses if loss.ticks != 0]
-        if not lost:
+        total = sum(loss.ticks for loss in self.losses)
+        if total == 0:
             return "no tick is lost"
-        known = [loss.ticks for loss in lost if loss.ticks is not None]
-        total = f"{sum(known)} ticks are lost" if sum(known) != 1 else "1 tick is lost"
-        if len(known) < len(lost):
-            total = f"at least {total}" if known else "an unknown number of ticks is lost"
-        return f"{total} ({', '.join(map(self._place, lost[:_SHOWN_LOSSES]))}" + (
-            f" and {len(lost) - _SHOWN_LOSSES} more places)" if len(lost) > _SHOWN_LOSSES else ")"
-        )
+        places = ", ".join(loss.place for loss in self.losses[:_SHOWN_LOSSES])
+        if (more := len(self.losses) - _SHOWN_LOSSES) > 0:
+            places += f" and {more} more places"
+        return f"{total} ticks are lost ({places})" if total > 1 else f"1 tick is lost ({places})"
 
-    def _place(self, loss: Loss) -> str:
-        first = loss.after[0] + 1 if loss.after else 0
-        if loss.before is None and loss.ticks is None:
-            return f"from tick {first} on"
-        end = loss.before[0] if loss.before else first + (loss.ticks or 0)
-        ticks = f"tick {first}" if end - first == 1 else f"ticks {first} to {end - 1}"
-        if loss.after is None or loss.before is None:
-            return ticks
-        start, stop = (
-            (time - self._start_ns) / NS_PER_S for time in (loss.after[1], loss.before[1])
-        )
-        return f"{ticks} between {start:.2f} and {stop:.2f} s"
-
-    def _add_loss(self, last: RawTick | None, raw: RawTick) -> None:
-        after = (last.index, last.time_ns) if last else None
-        first = last.index + 1 if last else 0
-        before = (raw.index, raw.time_ns)
-        self.losses.append(Loss(after, before, max(0, raw.index - first)))
-
-    def _add_final_loss(self, last: RawTick | None, count: int) -> None:
-        """Add damage at the end; the statistics give the number of lost ticks."""
-        after = (last.index, last.time_ns) if last else None
-        summary, ticks = self._file.summary, None
-        if summary and summary.statistics:
-            written = [
-                summary.statistics.channel_message_counts.get(channel.id, 0)
-                for channel in summary.channels.values()
-                if channel.topic == Topic.STATE
-            ]
-            ticks = max(0, sum(written) - count - sum(loss.ticks or 0 for loss in self.losses))
-        self.losses.append(Loss(after, None, ticks))
-
-    def _grouped(self) -> Iterator[RawTick | Damage]:
-        """The messages of each tick, and damage, in file order."""
-        raw: RawTick | None = None
-        for record in self._file.records():
-            if isinstance(record, Schema):
-                self._schemas[record.id] = record
-            elif isinstance(record, Channel):
-                self._add_channel(record)
-            elif isinstance(record, Message | Damage):
-                same = isinstance(record, Message) and raw and raw.index == record.sequence
-                if raw is not None and not same:
-                    yield raw
-                    raw = None
-                if isinstance(record, Damage):
+    def _messages(self) -> Iterator[Message | None]:
+        """The messages in file order; None for each damaged chunk, which holds one tick."""
+        for records in self._file.chunks():
+            if records is None:
+                yield None
+            for record in records or ():
+                if isinstance(record, Schema):
+                    self._schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    self._add_channel(record)
+                elif isinstance(record, Message) and record.channel_id in self._topic_of:
                     yield record
-                elif channel := self._channel(record.channel_id):
-                    raw = raw or self._raw_tick(record)
-                    raw.messages[channel.topic] = record
-        if raw is not None:
-            yield raw
-
-    def _raw_tick(self, first: Message) -> RawTick:
-        return RawTick(first.sequence, first.log_time, self.topics, self._decoders)
-
-    def _channel(self, number: int) -> Channel | None:
-        """A channel; if its own record is damaged, it is taken from the summary."""
-        if number not in self._channels and self._file.summary:
-            channel = self._file.summary.channels.get(number)
-            if channel is not None:
-                self._add_channel(channel)
-        return self._channels.get(number)
 
     def _add_channel(self, channel: Channel) -> None:
-        repeated = self._file.summary.schemas if self._file.summary else {}
-        schema = self._schemas.get(channel.schema_id) or repeated.get(channel.schema_id)
+        schema = self._schemas.get(channel.schema_id)
         if schema is not None:
-            self._channels[channel.id] = channel
+            self._topic_of[channel.id] = channel.topic
             self.topics[channel.topic] = RecordedTopic(
                 channel.topic, schema, channel.message_encoding
             )
 
     def _read_metadata(self) -> Mapping[str, str]:
         """The metadata record before the first tick, or its copy at the end."""
-        found = False
-        for record in self._first_records():
-            if isinstance(record, Metadata) and record.name == METADATA_NAME:
-                found = True
-                if checksum_matches(record.metadata):
-                    return without_checksum(record.metadata)
-        for entry in self._file.summary.metadata if self._file.summary else ():
-            copy = self._file.metadata_at(entry.offset)
-            if copy and copy.name == METADATA_NAME and checksum_matches(copy.metadata):
-                self._metadata_damaged = True
-                return without_checksum(copy.metadata)
-        if found or self._file.damage:
-            raise DataError(
-                f"{self._path}: its metadata record {METADATA_NAME!r} is damaged, and there is no "
-                "readable copy of it at the end; the recording cannot be read"
-            )
+        for record in self._file.metadata():
+            if record.name == METADATA_NAME and checksum_matches(record.metadata):
+                return without_checksum(record.metadata)
         raise DataError(
-            f"{self._path} has no metadata record {METADATA_NAME!r} before its first message; "
-            "expected a recording of egovcp"
+            f"{self._path}: its metadata record {METADATA_NAME!r} is damaged or missing; expected "
+            "a recording of egovcp"
         )
 
-    def _first_records(self) -> Iterator[McapRecord | Damage]:
-        for record in self._file.records():
-            if isinstance(record, Message | Channel | Schema):
-                return
-            yield record
 
-    def _info(self) -> RunInfo:
-        try:
-            return RunInfo.from_metadata(self.metadata)
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
-            problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
-            raise DataError(f"{self._path}: {problem}") from error
-
-
-_SHOWN_LOSSES: Final = 5
+def _loss(ticks: int, last: RawTick | None, following: RawTick | None, start_ns: int) -> Loss:
+    """A loss between two readable ticks, or at an end; ``start_ns`` is the time of tick 0."""
+    first = last.index + 1 if last else 0
+    end = following.index if following else first + ticks
+    place = f"tick {first}" if end - first == 1 else f"ticks {first} to {end - 1}"
+    if last and following:
+        start, stop = ((raw.time_ns - start_ns) / NS_PER_S for raw in (last, following))
+        place += f" between {start:.2f} and {stop:.2f} s"
+    return Loss(ticks, place)
 
 
 def _require_mcap(path: Path) -> None:

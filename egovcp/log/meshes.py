@@ -149,8 +149,8 @@ def value_colours(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     v = np.nan_to_num(np.asarray(values, np.float64))
     span = float(v.max() - v.min()) if v.size else 0.0
     share = (v - v.min()) / span if span > 0 else np.ones_like(v)
-    at = share * (len(_STOPS) - 1)
-    low = np.minimum(at.astype(int), len(_STOPS) - 2)
-    rest = (at - low)[:, None]
-    mixed: NDArray[np.float64] = _STOPS[low] * (1 - rest) + _STOPS[low + 1] * rest
+    at = np.linspace(0.0, 1.0, len(_STOPS))
+    mixed: NDArray[np.float64] = np.stack(
+        [np.interp(share, at, stops) for stops in _STOPS.T], axis=1
+    )
     return np.rint(mixed).astype(np.uint8)

@@ -43,7 +43,7 @@ _JOINTS: Final = ",".join(JOINT_NAMES)
 _ACTIONS: Final = ",".join(ACTION_NAMES)
 _STATES: Final = ",".join(STATE_NAMES)
 _FLAGS: Final = ("terminated", "truncated", "success")
-MOTOR_STATUS_ROWS: Final = ("faults", "lost", "enabled")
+MOTOR_STATUS_ROWS: Final = ("faults", "enabled")
 
 
 class Topic(StrEnum):
@@ -57,7 +57,7 @@ class Topic(StrEnum):
     BASE = "/robot/base_pose"  # from the simulator
     JOINTS = "/robot/joint_states"
     MOTOR_TEMPERATURE = "/robot/motor_temperature"  # rows: casing and winding, or one value
-    MOTOR_STATUS = "/robot/motor_status"  # rows: the reported ones of faults, lost, enabled
+    MOTOR_STATUS = "/robot/motor_status"  # rows: the reported ones of faults, enabled
     STATE = "/policy/state"
     ACTION = "/policy/action"  # as sent
     ACTION_PLANNED = "/policy/action_planned"
@@ -282,22 +282,16 @@ def motor_readings(messages: Mapping[str, Any]) -> MotorReadings | None:
     return MotorReadings(
         torque=np.array(joints.effort, np.float64),
         temperature=None if temperature is None else _array(temperature).T,
-        faults=_integers(status.get("faults")),
-        lost=_integers(status.get("lost")),
+        faults=status["faults"].astype(np.int64) if "faults" in status else None,
         enabled=None if "enabled" not in status else status["enabled"] != 0.0,
     )
 
 
 def _rows(message: Any) -> dict[str, NDArray[np.float64]]:
-    """Label -> row of a matrix."""
     if message is None:
         return {}
     names = message.layout.dim[0].label.split(",")
     return dict(zip(names, _array(message), strict=True))
-
-
-def _integers(row: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
-    return None if row is None else row.astype(np.int64)
 
 
 def _array(message: Any) -> NDArray[np.float64]:

@@ -1,13 +1,15 @@
-"""Draws a rollout as one PNG: key frames above the curves of value and return.
+"""Draws a rollout as a PNG and as a video, without a GPU or a display.
 
-Rows: the robot, the depth image, its reconstruction, and the image of the same tick imagined
-`AHEAD` ticks before. Rows without data are left out. Needs neither a GPU nor a display.
+The PNG shows key frames above the curves of value and return. Rows: the robot, the depth image, its
+reconstruction, and the image of the same step imagined `AHEAD` steps before. Rows without data are
+left out. A video frame shows the robot, the depth image and the imagined image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,24 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.log.meshes import LinkMesh, link_meshes
-from egovcp.log.pose import robot_pose
-from egovcp.log.sketch import (
-    Viewpoint,
-    paint,
-    paint_floor,
-    paint_skeleton,
-    robot_surface,
-    scene_surface,
-)
+from egovcp.log.meshes import link_meshes
+from egovcp.log.scene_plot import AXES_OPTIONS, draw_scene
 from egovcp.log.tick import RunInfo, Tick
+from egovcp.packages import require_packages
 from egovcp.spec import DEPTH_MAX_M, PLANNER_DT
 
 KEY_FRAMES: Final = 7
 AHEAD: Final = 8  # ticks between the imagining of the shown image and its tick
 _BEFORE_TICKS: Final = 2  # from the first key frame to the first event
 _AFTER_TICKS: Final = 6  # from the last event to the last key frame
-_MESH_GRID_M: Final = 0.024
+_MESH_GRID_M: Final = 0.03
+_DPI: Final = 100  # of a video
+SIZE: Final = (640, 360)
+"""Width and height of a video, pixels; even, as H.264 requires."""
+STRIDE: Final = 2
+"""Steps between frames of a video: 12.5 frames per second."""
 _STYLES: Final = {
     "value of the plan": "C0",
     "termination probability": "C3",
@@ -43,6 +43,7 @@ _ROW_INCH: Final = 1.419  # a row of images
 _CURVES_INCH: Final = 2.408  # the curves
 
 
+type Frame = NDArray[np.uint8]
 type DepthRows = dict[str, list[NDArray[np.floating] | None]]
 type Curves = dict[str, list[float | None]]
 
@@ -84,8 +85,6 @@ class PictureSink:
         for path in set(self._paths).difference(videos):
             rollout_picture(ticks, path, self._title)
         if videos:
-            from egovcp.log.video import write_videos
-
             write_videos(ticks, videos)
 
 
@@ -136,36 +135,22 @@ def _draw_images(
 ) -> None:
     place = _place(figure, _CURVES_INCH, figure.get_figheight() - _TOP_INCH)
     grid = figure.add_gridspec(1 + len(rows), len(frames), hspace=0.04, wspace=0.03, **place)
-    first, *others = grid.subplots(squeeze=False)
     meshes = link_meshes(_MESH_GRID_M)
-    for axes, i in zip(first, frames, strict=True):
-        draw_robot(axes, ticks[i], meshes)
+    for column, i in enumerate(frames):
+        axes = figure.add_subplot(grid[0, column], **AXES_OPTIONS)
+        draw_scene(axes, ticks[i], meshes)
         axes.set_title(f"{ticks[i].index * PLANNER_DT:.2f} s", fontsize=9)
-    for row, (name, images) in zip(others, rows.items(), strict=True):
-        row[0].set_ylabel(name, fontsize=9)
-        for axes, depth in zip(row, images, strict=True):
-            draw_depth(axes, depth)
+        for row, (name, images) in enumerate(rows.items(), start=1):
+            axes = figure.add_subplot(grid[row, column])
+            draw_depth(axes, images[column])
+            if column == 0:
+                axes.set_ylabel(name, fontsize=9)
 
 
 def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
     """The image of tick i imagined at tick i - AHEAD, (48, 64) m; None: there is none."""
     images = ticks[i - AHEAD].depth_imagined if i >= AHEAD else None
     return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
-
-
-def draw_robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
-    """Draw robot and scene of a tick; without meshes the robot is a skeleton."""
-    pose = robot_pose(tick)
-    pelvis_w = pose.positions_w[0]
-    view = Viewpoint().following(pelvis_w)
-    paint_floor(axes, view, pelvis_w)
-    surfaces = robot_surface(pose, meshes) + scene_surface(tick.scene)
-    if not meshes:
-        paint_skeleton(axes, pose, view)
-    if surfaces:
-        paint(axes, surfaces, view)
-    axes.set(xlim=(-1.0, 1.0), ylim=(-0.75, 0.75), xticks=[], yticks=[], aspect="equal")
-    axes.set_frame_on(False)
 
 
 def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
@@ -228,3 +213,70 @@ def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
             va="top",
             fontsize=7,
         )
+
+
+def write_videos(ticks: Sequence[Tick], paths: Sequence[Path]) -> None:
+    """Draw ``ticks`` (in order, without gaps) into each path, a ``.gif`` or ``.mp4``.
+
+    Raises:
+        EnvironmentFailure: the package that encodes this format is not installed.
+    """
+    images = list(video_frames(ticks))
+    for path in paths:
+        write = _write_gif if path.suffix == ".gif" else _write_mp4
+        write(images, path)
+
+
+def video_frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
+    """Every `STRIDE`-th tick as an RGB image (H, W, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    meshes = link_meshes(_MESH_GRID_M)
+    width, height = SIZE
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    scene = figure.add_axes((0.0, 0.0, 0.66, 0.93), **AXES_OPTIONS)
+    titles = ("depth image", f"imagined {AHEAD * PLANNER_DT:.2f} s before")
+    images = [figure.add_axes((0.68, 0.52 - 0.5 * row, 0.3, 0.4)) for row in range(len(titles))]
+    for axes, title in zip(images, titles, strict=True):
+        axes.set_title(title, fontsize=8)
+    clock = figure.text(0.02, 0.94, "", fontsize=9)
+    for i in range(0, len(ticks), STRIDE):
+        # Axes are slow to make: only what they show is replaced.
+        for artist in (*scene.collections, *(image for axes in images for image in axes.images)):
+            artist.remove()
+        draw_scene(scene, ticks[i], meshes)
+        draw_depth(images[0], ticks[i].depth / 1000.0)
+        draw_depth(images[1], imagined_of(ticks, i))
+        clock.set_text(f"{ticks[i].index * PLANNER_DT:.2f} s")
+        canvas.draw()  # type: ignore[no-untyped-call]
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
+
+
+def _write_gif(images: Sequence[Frame], path: Path) -> None:
+    from PIL import Image
+
+    # One palette, of frames from the whole video: smaller files, and no flicker.
+    some = Image.fromarray(np.concatenate(images[:: max(1, len(images) // 8)]))
+    palette = some.quantize(128, dither=Image.Dither.NONE)
+    first, *others = [
+        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+        for image in images
+    ]
+    milliseconds = round(1000 * STRIDE * PLANNER_DT)
+    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
+def _write_mp4(images: Sequence[Frame], path: Path) -> None:
+    require_packages("egovcp", "an MP4 video", "av")
+    import av
+
+    rate = Fraction(1 / (STRIDE * PLANNER_DT)).limit_denominator(100)
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=rate, options={"crf": "23"})
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))

@@ -1,6 +1,7 @@
-"""Messages between an `AsyncSink` and its writer process, through non-blocking pipes.
+"""Messages between an `AsyncSink` and its writer process, through pipes.
 
-A message on the wire is its length (u32, little endian) and its pickle.
+On the wire they have the format of `multiprocessing.connection.Connection`, which reads them: the
+length and the pickle.
 """
 
 from __future__ import annotations
@@ -14,79 +15,26 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from egovcp.log.sink import Sink
 from egovcp.log.tick import RunInfo, Tick
 
-_LENGTH: Final = struct.Struct("<I")
+_LENGTH: Final = struct.Struct("!i")
 _PIPE_BYTES: Final = 1 << 20  # several ticks; the default of 64 KiB does not hold one
-_READ_BYTES: Final = 1 << 20
 _POLL_S: Final = 0.005
 _MAX_PARTS: Final = 64  # of one system call
 
 
-# --- commands ---------------------------------------------------------------------
-@dataclass(frozen=True)
-class Open:
-    """Open the sink."""
+type Command = tuple[Sink, RunInfo] | Tick | None
+"""First the sink to open and its run, then ticks; None closes the sink."""
 
-    sink: Sink
-    info: RunInfo
-    waits: bool = False
-    """Wait while the disk is full, if the sink can retry; otherwise a full disk is an error."""
+type WriterReport = int | Exception | None
+"""The number of ticks written, 0 when the sink is open; the error that ended the sink; or None when
+the sink is closed."""
 
 
-@dataclass(frozen=True)
-class Close:
-    """Close the sink; the last command."""
-
-
-type Command = Open | Tick | Close
-
-
-# --- reports ----------------------------------------------------------------------
-@dataclass(frozen=True)
-class Opened:
-    """The sink is open."""
-
-
-@dataclass(frozen=True)
-class Written:
-    """Total number of ticks written."""
-
-    count: int
-
-
-@dataclass(frozen=True)
-class Waiting:
-    """The disk is full; further ticks wait in the pipe."""
-
-    error: OSError
-
-
-@dataclass(frozen=True)
-class Resumed:
-    """The disk has room again; no accepted tick was lost."""
-
-
-@dataclass(frozen=True)
-class Failed:
-    """The sink raised this error and is not used any more."""
-
-    error: Exception
-
-
-@dataclass(frozen=True)
-class Closed:
-    """The sink is closed."""
-
-
-type WriterReport = Opened | Written | Waiting | Resumed | Failed | Closed
-
-
-# --- transport --------------------------------------------------------------------
 def enlarge(descriptor: int) -> None:
     """Enlarge the buffer of a pipe where the system allows it (Linux)."""
     if sys.platform.startswith("linux"):
@@ -118,11 +66,7 @@ class Outbox:
         self._messages.append(2)
 
     def pump(self) -> None:
-        """Write as many bytes as the pipe takes without blocking.
-
-        Raises:
-            BrokenPipeError: the reader is closed.
-        """
+        """Write as many bytes as the pipe takes without blocking."""
         with suppress(BlockingIOError):
             while self._parts:
                 some = [self._parts[i] for i in range(min(len(self._parts), _MAX_PARTS))]
@@ -141,47 +85,14 @@ class Outbox:
                 self._messages.popleft()
 
 
-class Inbox:
-    """Reads messages from a pipe."""
-
-    def __init__(self, descriptor: int) -> None:
-        os.set_blocking(descriptor, False)
-        self._descriptor = descriptor
-        self._buffer = bytearray()
-
-    def ready(self) -> Iterator[Any]:
-        """The messages that have arrived; does not block.
-
-        Raises:
-            EOFError: the writer is closed and all messages have been returned.
-        """
-        yield from self._complete()
-        with suppress(BlockingIOError):
-            while True:
-                data = os.read(self._descriptor, _READ_BYTES)
-                if not data:
-                    raise EOFError
-                self._buffer += data
-                yield from self._complete()
-
-    def _complete(self) -> Iterator[Any]:
-        while len(self._buffer) >= _LENGTH.size:
-            end = _LENGTH.size + _LENGTH.unpack_from(self._buffer)[0]
-            if len(self._buffer) < end:
-                return
-            message = bytes(self._buffer[_LENGTH.size : end])
-            del self._buffer[:end]
-            yield pickle.loads(message)  # noqa: S301 - from the other end of our own pipe
-
-
-def receive(descriptor: int) -> Iterator[Any]:
+def receive(connection: Connection) -> Iterator[Any]:
     """Messages from a pipe until its writer is closed.
 
     It polls every few milliseconds: a blocking read would be woken by each write and preempt the
     writer on a machine with one core.
     """
-    inbox = Inbox(descriptor)
-    with suppress(EOFError):
+    with suppress(EOFError, OSError):  # OSError: in the middle of a message
         while True:
-            yield from inbox.ready()
-            time.sleep(_POLL_S)
+            while not connection.poll():
+                time.sleep(_POLL_S)
+            yield connection.recv()

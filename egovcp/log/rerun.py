@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
@@ -23,14 +24,13 @@ from egovcp.log.pose import robot_poses
 from egovcp.log.rerun_columns import Frame, all_columns, log_value_map_styles, skeleton_columns
 from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
 from egovcp.log.tick import CameraView, RunInfo, SceneObject, Tick
-from egovcp.log.viewer import Destination, RrdFile
+from egovcp.log.viewer import Viewer
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
 
 BATCH_TICKS: Final = 25  # one second
 LIVE_BATCH_TICKS: Final = 3  # for a low delay
 _VIEWER_TIMEOUT_S: Final = 10.0
 _DISK_TIMEOUT_S: Final = 60.0
-_NS: Final = "ns"
 
 
 class RerunSink:
@@ -39,9 +39,8 @@ class RerunSink:
     A viewer may end or hang: wrap the sink in an `AsyncSink`, which does not wait for it.
 
     Args:
-        destination: path of the ``.rrd`` file to create, or another destination. `open` raises
+        destination: path of the ``.rrd`` file to create, or a viewer. `open` raises
             `EnvironmentFailure` if the file exists or no viewer listens.
-        imagined: horizons of the imagined depth to show, planner ticks ahead.
         meshes: draw the meshes of the links if the model is installed, else a skeleton.
         signals: show curves of action and proprioception instead of plans and values, for
             recordings without a planner.
@@ -49,42 +48,36 @@ class RerunSink:
 
     def __init__(
         self,
-        destination: Path | Destination,
-        imagined: tuple[int, ...] = (4, 8, 16),
+        destination: Path | Viewer,
         meshes: bool = True,
         signals: bool = False,
     ) -> None:
-        if isinstance(destination, Path):
-            destination = RrdFile(destination)
         self._destination = destination
-        self._imagined = imagined
+        live = isinstance(destination, Viewer)
+        self._timeout_s = _VIEWER_TIMEOUT_S if live else _DISK_TIMEOUT_S
+        self._batch_ticks = LIVE_BATCH_TICKS if live else BATCH_TICKS
         self._wants_meshes = meshes
         self._meshes: dict[str, LinkMesh] = {}
         self._signals = signals
-        self._motors_shown: dict[str, set[int]] = {}
+        self._faulty_joints: set[int] = set()
         self._batch: list[Tick] = []
         self._known: set[str] = set()
         self._stream: rr.RecordingStream | None = None
         self._failed = False
-
-    @property
-    def _timeout_s(self) -> float:
-        return _VIEWER_TIMEOUT_S if self._destination.is_live else _DISK_TIMEOUT_S
-
-    @property
-    def _batch_ticks(self) -> int:
-        return LIVE_BATCH_TICKS if self._destination.is_live else BATCH_TICKS
 
     def open(self, info: RunInfo) -> None:
         """Start the recording and log static data."""
         self._view = info.camera
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
-        look = signals_blueprint() if self._signals else blueprint(self._imagined)
-        self._destination.attach(stream, look)
+        layout = signals_blueprint() if self._signals else blueprint()
+        if isinstance(self._destination, Viewer):
+            self._destination.attach(stream, layout)
+        else:
+            _create_file(self._destination, stream, layout)
         stream.send_recording_name(name)
         self._stream = stream
-        _log_static(stream, info, self._imagined)
+        _log_static(stream, info)
         if self._signals:
             log_styles(stream)
         else:
@@ -101,18 +94,13 @@ class RerunSink:
             stream.log(f"{paths.ROBOT}/{link}", surface, static=True)
 
     def write(self, tick: Tick) -> None:
-        """Add the tick to the batch; send a full batch.
-
-        Raises:
-            EnvironmentFailure: the disk is full, the viewer has ended, or one of them hangs.
-        """
+        """Add the tick to the batch; send a full batch."""
         self._batch.append(tick)
         if len(self._batch) >= self._batch_ticks:
             self._send()
             self._flush()
 
     def close(self) -> None:
-        """Send the last batch and close the recording."""
         if self._stream is None or self._failed:
             return
         if self._batch:
@@ -128,7 +116,7 @@ class RerunSink:
         except RuntimeError as error:
             self._failed = True
             raise EnvironmentFailure(
-                f"the recording could not be sent (disk full, viewer gone?): {error}"
+                f"cannot send the recording: disk full, or viewer closed ({error})"
             ) from error
 
     def _send(self) -> None:
@@ -136,13 +124,13 @@ class RerunSink:
         poses = robot_poses(self._batch)
         frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
         self._log_new_objects()
-        groups = [*all_columns(frames, self._view, self._imagined)]
+        groups = [*all_columns(frames, self._view)]
         if not self._meshes:
             groups.append(skeleton_columns(frames))
         if self._signals:
             groups += signal_columns(self._batch)
         else:
-            groups += motor_columns(self._batch, self._motors_shown)
+            groups += motor_columns(self._batch, self._faulty_joints)
         for path, ticks, columns in groups:
             if ticks:
                 self._stream.send_columns(path, _times(ticks), columns)
@@ -158,8 +146,19 @@ class RerunSink:
                     self._stream.log(path, _shape(thing), static=True)
 
 
+def _create_file(path: Path, stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    if path.exists():
+        raise EnvironmentFailure(
+            f"{path} exists already; recordings are never overwritten: choose another"
+        )
+    try:
+        stream.save(path, default_blueprint=layout)
+    except RuntimeError as error:  # Rerun has no other type for it
+        raise EnvironmentFailure(f"cannot create {path}: {error}") from error
+
+
 def _times(ticks: Sequence[Tick]) -> list[rr.TimeColumn]:
-    durations = np.array([tick.time_ns for tick in ticks], f"timedelta64[{_NS}]")
+    durations = np.array([tick.time_ns for tick in ticks], "timedelta64[ns]")
     return [
         rr.TimeColumn("tick", sequence=[tick.index for tick in ticks]),
         rr.TimeColumn("time", duration=durations),
@@ -172,12 +171,11 @@ def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
     return rr.Boxes3D(half_sizes=[thing.size], colors=[OBSTACLE], fill_mode="solid")
 
 
-def _log_static(stream: rr.RecordingStream, info: RunInfo, imagined: tuple[int, ...]) -> None:
+def _log_static(stream: rr.RecordingStream, info: RunInfo) -> None:
     stream.log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log(paths.CAMERA, _pinhole(info.camera), static=True)
-    images = [paths.DEPTH, paths.RECONSTRUCTED]
-    images += [f"{paths.IMAGINED}/{i}" for i in range(len(imagined))]
-    for path in images:
+    imagined = [f"{paths.IMAGINED}/{i}" for i in range(len(paths.IMAGINED_TICKS))]
+    for path in (paths.DEPTH, paths.RECONSTRUCTED, *imagined):
         stream.log(path, depth_style(), static=True)
     hands = rr.Points3D.from_fields(colors=[LEFT, RIGHT], radii=[0.03], show_labels=False)
     stream.log(paths.HAND_TARGETS, hands, static=True)

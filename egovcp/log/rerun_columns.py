@@ -41,19 +41,13 @@ class Columns(NamedTuple):
     columns: Iterable[Any]
 
 
-def all_columns(
-    frames: Sequence[Frame], view: CameraView, imagined: Sequence[int]
-) -> Iterator[Columns]:
-    """Everything that changes with time.
-
-    Args:
-        imagined: horizons of the imagined depth to show, ticks ahead.
-    """
+def all_columns(frames: Sequence[Frame], view: CameraView) -> Iterator[Columns]:
+    """Everything that changes with time."""
     yield from _robot(frames)
     yield _camera(frames, view)
-    yield from _depths([frame.tick for frame in frames], imagined)
-    yield from _plans(frames)
     ticks = [frame.tick for frame in frames]
+    yield from _depths(ticks)
+    yield from _plans(frames)
     yield from _scene(ticks)
     yield from _scalars(ticks)
     yield from _events(ticks)
@@ -105,34 +99,22 @@ def _camera(frames: Sequence[Frame], view: CameraView) -> Columns:
     return Columns(paths.CAMERA, [frame.tick for frame in frames], columns)
 
 
-def _depths(ticks: Sequence[Tick], imagined: Sequence[int]) -> Iterator[Columns]:
-    yield _images(paths.DEPTH, ticks, lambda tick: tick.depth)
-    decoded = [tick for tick in ticks if tick.depth_reconstructed is not None]
-    yield _images(paths.RECONSTRUCTED, decoded, lambda tick: _decoded(tick.depth_reconstructed))
-    for i, k in enumerate(imagined):
-        shown = [t for t in ticks if t.depth_imagined is not None and len(t.depth_imagined) >= k]
-        yield _images(f"{paths.IMAGINED}/{i}", shown, _frame_at(k))
+def _depths(ticks: Sequence[Tick]) -> Iterator[Columns]:
+    yield _images(paths.DEPTH, [(tick, tick.depth) for tick in ticks])
+    decoded = [(t, t.depth_reconstructed) for t in ticks if t.depth_reconstructed is not None]
+    yield _images(paths.RECONSTRUCTED, [(tick, to_millimetres(image)) for tick, image in decoded])
+    strips = [(tick, tick.depth_imagined) for tick in ticks if tick.depth_imagined is not None]
+    for i, k in enumerate(paths.IMAGINED_TICKS):
+        shown = [
+            (tick, to_millimetres(images[k - 1])) for tick, images in strips if len(images) >= k
+        ]
+        yield _images(f"{paths.IMAGINED}/{i}", shown)
 
 
-def _frame_at(k: int) -> Callable[[Tick], NDArray[np.uint16]]:
-
-    def pick(tick: Tick) -> NDArray[np.uint16]:
-        images = tick.depth_imagined
-        return _decoded(None if images is None else images[k - 1])
-
-    return pick
-
-
-def _decoded(depth_m: Array | None) -> NDArray[np.uint16]:
-    assert depth_m is not None, "only ticks that have the image are asked for it"
-    return to_millimetres(depth_m)
-
-
-def _images(
-    path: str, ticks: Sequence[Tick], image: Callable[[Tick], NDArray[np.uint16]]
-) -> Columns:
-    buffers = [np.ascontiguousarray(image(tick)).view(np.uint8).ravel() for tick in ticks]
-    return Columns(path, ticks, rr.DepthImage.columns(buffer=buffers) if ticks else ())
+def _images(path: str, shown: Sequence[tuple[Tick, NDArray[np.uint16]]]) -> Columns:
+    buffers = [np.ascontiguousarray(image).view(np.uint8).ravel() for _, image in shown]
+    columns = rr.DepthImage.columns(buffer=buffers) if shown else ()
+    return Columns(path, [tick for tick, _ in shown], columns)
 
 
 def _plans(frames: Sequence[Frame]) -> Iterator[Columns]:

@@ -14,14 +14,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.log import paths
-from egovcp.log.meshes import LEFT
 from egovcp.log.rerun_columns import Columns, named_columns
 from egovcp.log.tick import MODES, Tick
 from egovcp.spec import ACTION_BOX, ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 _LEG_JOINTS: Final = ("hip", "knee", "ankle")
-_AXES: Final = {"x": (224, 80, 72), "y": (98, 184, 92), "z": (82, 138, 230)}
-_COLOURS: Final = _AXES | {"done": LEFT, "success": (98, 184, 92)}
 LIMBS: Final = ("left_leg", "right_leg", "waist", "left_arm", "right_arm")
 
 
@@ -34,12 +31,6 @@ class Signal:
     """One per line."""
     values: Callable[[Tick], Sequence[float] | NDArray[np.floating]]
     """Their values at a tick, in the order of ``names``."""
-
-    @property
-    def colours(self) -> list[tuple[int, int, int]] | None:
-        """One per line; x, y and z have fixed colours. None: chosen by the viewer."""
-        known = [_COLOURS[name] for name in self.names if name in _COLOURS]
-        return known if len(known) == len(self.names) else None
 
 
 def limb(joint: str) -> str:
@@ -95,14 +86,12 @@ SIGNALS: Final = (*_actions(), *_states(), *_outcomes())
 
 
 def log_styles(stream: rr.RecordingStream) -> None:
-    """Log names and colours of the lines of every signal, once per recording."""
+    """Log the names of the lines of every signal, once per recording."""
     for signal in SIGNALS:
-        lines = rr.SeriesLines(names=list(signal.names), colors=signal.colours)
-        stream.log(signal.path, lines, static=True)
+        stream.log(signal.path, rr.SeriesLines(names=list(signal.names)), static=True)
 
 
 def signal_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
-    """Every signal at every tick."""
     for signal in SIGNALS:
         values = np.array([signal.values(tick) for tick in ticks], np.float64)  # (n, lines)
         columns = rr.Scalars.columns(scalars=values.ravel())
@@ -117,12 +106,11 @@ def log_motor_styles(stream: rr.RecordingStream) -> None:
             stream.log(f"{path}/{name}", lines, static=True)
 
 
-def motor_columns(ticks: Sequence[Tick], shown: dict[str, set[int]]) -> Iterator[Columns]:
-    """Torque, temperature, faults, lost packets, connection and state of the runner.
+def motor_columns(ticks: Sequence[Tick], faulty: set[int]) -> Iterator[Columns]:
+    """Torque, temperature, faults, connection and state of the runner.
 
-    Args:
-        shown: path -> joints with a curve of faults or lost packets. Joints with a first non-zero
-            value are added; they keep their curve in later batches.
+    ``faulty`` are the joints with a curve of faults. Joints with a first fault are added; they keep
+    their curve in later batches.
     """
     read = [(tick, tick.motors) for tick in ticks if tick.motors is not None]
     yield from _limbs(paths.MOTOR_TORQUE, [(tick, m.torque) for tick, m in read])
@@ -132,8 +120,14 @@ def motor_columns(ticks: Sequence[Tick], shown: dict[str, set[int]]) -> Iterator
         if m.temperature is not None
     ]
     yield from _limbs(paths.MOTOR_TEMPERATURE, hottest)
-    for path, field in ((paths.MOTOR_FAULTS, "faults"), (paths.MOTOR_LOST, "lost")):
-        yield from named_columns(path, ticks, _nonzero(ticks, field, shown.setdefault(path, set())))
+    rows = {tick.index: m.faults for tick, m in read if m.faults is not None}
+    faulty.update(int(joint) for row in rows.values() for joint in np.flatnonzero(row))
+
+    def faults(tick: Tick) -> Mapping[str, float]:
+        row = rows.get(tick.index)
+        return {} if row is None else {JOINT_NAMES[i]: float(row[i]) for i in sorted(faulty)}
+
+    yield from named_columns(paths.MOTOR_FAULTS, ticks, faults)
     yield from named_columns(paths.LINK, ticks, lambda tick: tick.link)
     yield from named_columns(paths.RUNNER, ticks, _mode)
 
@@ -147,22 +141,6 @@ def _limbs(path: str, rows: Sequence[tuple[Tick, NDArray[np.floating]]]) -> Iter
     for name, joints in _JOINTS_OF.items():
         columns = rr.Scalars.columns(scalars=values[:, joints].ravel())
         yield Columns(f"{path}/{name}", ticks, columns.partition([len(joints)] * len(ticks)))
-
-
-def _nonzero(
-    ticks: Sequence[Tick], field: str, shown: set[int]
-) -> Callable[[Tick], Mapping[str, float]]:
-    """A function from a tick to the values of the joints in ``shown``."""
-    rows = [getattr(tick.motors, field, None) for tick in ticks]
-    known = [row for row in rows if row is not None]
-    if known:
-        shown.update(map(int, np.flatnonzero(np.any(known, axis=0))))
-
-    def values(tick: Tick) -> Mapping[str, float]:
-        row = getattr(tick.motors, field, None)
-        return {} if row is None else {JOINT_NAMES[i]: float(row[i]) for i in sorted(shown)}
-
-    return values
 
 
 def _mode(tick: Tick) -> Mapping[str, float]:

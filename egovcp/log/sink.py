@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from egovcp.log.tick import RunInfo, Tick
 
@@ -20,14 +20,6 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Complete the log on disk; further calls do nothing."""
-
-
-@runtime_checkable
-class RetryingSink(Sink, Protocol):
-    """A sink that keeps a tick in memory while the disk is full."""
-
-    def retry(self) -> None:
-        """Write that tick; raises OSError if the disk is still full."""
 
 
 class Fanout:

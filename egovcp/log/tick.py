@@ -60,8 +60,6 @@ class MotorReadings:
     none."""
     faults: NDArray[np.integer] | None = None
     """(29,) status bits of each motor, 0 without a fault."""
-    lost: NDArray[np.integer] | None = None
-    """(29,) packets lost to or from each motor since it was switched on."""
     enabled: NDArray[np.bool_] | None = None
     """(29,) whether each motor follows commands."""
 
@@ -161,7 +159,6 @@ class CameraView:
 
     @property
     def focal_px(self) -> float:
-        """Focal length, pixels."""
         return focal_length(self.vertical_fov)
 
     @property

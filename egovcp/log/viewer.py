@@ -1,4 +1,4 @@
-"""Destinations of a Rerun recording: a file, or a viewer, which `LiveRerun` can start.
+"""Rerun viewers: their addresses, and processes that `LiveRerun` starts.
 
 A started viewer is a separate process that listens on the loopback only. To view it from another
 machine, forward both ports: ``ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 ROBOT``.
@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import ClassVar, Final, Literal, Protocol, Self
+from typing import Final, Literal, Self
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -34,51 +34,10 @@ _START_TIMEOUT_S: Final = 30.0
 _END_TIMEOUT_S: Final = 3.0
 
 
-class Destination(Protocol):
-    """Receives a recording."""
-
-    is_live: ClassVar[bool]
-    """Whether it is shown while it is written."""
-
-    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
-        """Send the stream to the destination.
-
-        Args:
-            look: layout of the viewer.
-
-        Raises:
-            EnvironmentFailure: the file cannot be created, or no viewer listens.
-        """
-
-
-@dataclass(frozen=True)
-class RrdFile:
-    """A new file."""
-
-    is_live: ClassVar[bool] = False
-    path: Path
-
-    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
-        """Create the file."""
-        if self.path.exists():
-            raise EnvironmentFailure(
-                f"{self.path} exists already; recordings are never overwritten: choose another"
-            )
-        try:
-            stream.save(self.path, default_blueprint=look)
-        except RuntimeError as error:  # Rerun has no other type for it
-            raise EnvironmentFailure(f"cannot create {self.path}: {error}") from error
-
-
 @dataclass(frozen=True)
 class Viewer:
-    """A viewer, or a server for several, at ``rerun+http://HOST:PORT/proxy``.
+    """A viewer, or a server for several, at ``rerun+http://HOST:PORT/proxy``."""
 
-    Raises:
-        UsageError: the address has another form.
-    """
-
-    is_live: ClassVar[bool] = True
     url: str = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
 
     def __post_init__(self) -> None:
@@ -103,14 +62,14 @@ class Viewer:
         except OSError:
             return False
 
-    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
-        """Connect to the viewer."""
+    def attach(self, stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+        """Send the stream to the viewer; raises `EnvironmentFailure` if none listens."""
         if not self.answers:
             raise EnvironmentFailure(
                 f"no Rerun viewer answers at {self.url}; "
                 f"start one: rerun --bind {LOOPBACK} --port {self.address[1]}"
             )
-        stream.connect_grpc(self.url, default_blueprint=look)
+        stream.connect_grpc(self.url, default_blueprint=layout)
 
 
 type Kind = Literal["spawn", "web", "connect"]
@@ -133,18 +92,13 @@ class LiveRerun:
 
     @staticmethod
     def of(words: str) -> LiveRerun:
-        """``spawn``, ``web``, or the address of a viewer that runs.
-
-        Raises:
-            UsageError: none of these.
-        """
+        """``spawn``, ``web``, or the address of a viewer that runs."""
         if words == "spawn":
             return LiveRerun("spawn")
         return LiveRerun("web") if words == "web" else LiveRerun("connect", Viewer(words))
 
     @property
     def page(self) -> str:
-        """URL of the web page; empty unless ``web``."""
         if self.kind != "web":
             return ""
         port = self.viewer.address[1]
@@ -153,15 +107,10 @@ class LiveRerun:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the started viewer; None: there is none."""
         return self._process.pid if self._process else None
 
     def start(self) -> None:
-        """Start the viewer and wait until it listens; call it from the main thread.
-
-        Raises:
-            EnvironmentFailure: a port is in use, or the viewer ends at once (no display?).
-        """
+        """Start the viewer and wait until it listens; call it from the main thread."""
         if self.kind == "connect":
             return
         ports = [self.viewer.address[1], *([self.web_port] if self.kind == "web" else [])]
@@ -177,17 +126,17 @@ class LiveRerun:
         )
         self._await(ports)
 
-    def close(self) -> None:
-        """Stop the web server; a native viewer stays open."""
-        if self.kind == "web":
-            self._end()
-
     def __enter__(self) -> Self:
         self.start()
         return self
 
     def __exit__(self, *details: object) -> None:
         self.close()
+
+    def close(self) -> None:
+        """Stop the web server; a native viewer stays open."""
+        if self.kind == "web":
+            self._end()
 
     def _flags(self) -> list[str]:
         flags = ["--bind", LOOPBACK, "--port", str(self.viewer.address[1])]
@@ -239,6 +188,6 @@ def _require_free(port: int) -> None:
             probe.bind((LOOPBACK, port))
         except OSError as error:
             raise EnvironmentFailure(
-                f"port {port} is in use, perhaps by a viewer that runs already: to send to that, "
+                f"port {port} is in use, perhaps by a running viewer: to send to that viewer, "
                 f"give its address, {_url(port) if port != WEB_PORT else _url(GRPC_PORT)}"
             ) from error

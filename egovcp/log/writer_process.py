@@ -7,97 +7,52 @@ If the parent ends first, it writes what is left in the pipe, closes the sink an
 
 from __future__ import annotations
 
-import errno
 import os
 import pickle
 import signal
 import sys
-import time
 import traceback
-from collections.abc import Callable
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.pipe import (
-    Closed,
-    Failed,
-    Open,
-    Opened,
-    Outbox,
-    Resumed,
-    Waiting,
-    WriterReport,
-    Written,
-    pack,
-    receive,
-)
-from egovcp.log.sink import RetryingSink, Sink
-from egovcp.log.tick import Tick
+from egovcp.log.pipe import WriterReport, receive
+from egovcp.log.sink import Sink
 
 NICENESS: Final = 5  # the control loop has priority on a shared core
-RETRY_S: Final = 0.25  # between two attempts while the disk is full
 
 
-def serve(commands: int, reports: int) -> None:
+def serve(commands: Connection, reports: Connection) -> None:
     """Execute the commands of one pipe and report to the other, until the first is closed."""
-    outbox, parent = Outbox(reports), os.getppid()
+    messages = receive(commands)
     sink: Sink | None = None
-    waits, count = False, 0
     try:
-        for command in receive(commands):
-            match command:
-                case Open():
-                    sink, waits = command.sink, command.waits
-                    sink.open(command.info)
-                    _report(outbox, Opened())
-                case Tick() if sink is not None:
-                    try:
-                        sink.write(command)
-                    except OSError as error:
-                        if not waits or not isinstance(sink, RetryingSink) or not _is_full(error):
-                            raise
-                        _report(outbox, Waiting(error))
-                        _wait_for_room(sink, lambda: os.getppid() == parent)
-                        _report(outbox, Resumed())
-                    count += 1
-                    _report(outbox, Written(count))
-                case _:
-                    break
-        if sink is not None:
-            sink.close()
-        _report(outbox, Closed())
+        if (first := next(messages, None)) is None:
+            return  # the parent has ended
+        sink, info = first
+        sink.open(info)
+        _report(reports, 0)
+        for count, tick in enumerate(iter(lambda: next(messages, None), None), start=1):
+            sink.write(tick)
+            _report(reports, count)
+        sink.close()
+        _report(reports, None)
     except Exception as error:  # noqa: BLE001 - every error is reported to the parent
-        _report(outbox, Failed(_picklable(error)))
+        _report(reports, _picklable(error))
         with suppress(Exception):
             if sink is not None:
                 sink.close()
 
 
-def _is_full(error: OSError) -> bool:
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
-
-
-def _wait_for_room(sink: RetryingSink, parent_runs: Callable[[], bool]) -> None:
-    """Retry until the disk takes the tick; raise OSError on another error or without a parent."""
-    while True:
-        time.sleep(RETRY_S)
-        try:
-            return sink.retry()
-        except OSError as error:
-            if not _is_full(error) or not parent_runs():
-                raise
-
-
-def _report(outbox: Outbox, report: WriterReport) -> None:
+def _report(reports: Connection, report: WriterReport) -> None:
     """Send a report; without a reader it is dropped and the log is still written."""
     with suppress(BrokenPipeError):
-        outbox.put(pack(report))
-        outbox.pump()
+        reports.send(report)
 
 
 def _picklable(error: Exception) -> Exception:
-    """The error itself if it is ours or the system's and can be pickled, else its text."""
+    """The error itself if it is an `EgovcpError` or `OSError` and can be pickled, else its text."""
     if isinstance(error, EgovcpError | OSError):
         with suppress(Exception):
             pickle.dumps(error)
@@ -110,7 +65,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and closes the log
     with suppress(OSError):
         os.nice(NICENESS)
-    serve(int(sys.argv[1]), int(sys.argv[2]))
+    commands, reports = map(int, sys.argv[1:])
+    serve(Connection(commands, writable=False), Connection(reports, readable=False))
     sys.stderr.flush()
     os._exit(0)  # a library's exit handler may wait for a viewer that hangs
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
@@ -19,7 +19,7 @@ _LONGEST = 64
 ValueLoss = Literal["mse", "two_hot"]
 FreeNatsPer = Literal["step", "dimension"]
 Dynamics = Literal["joint", "autoregressive"]
-QTarget = Literal["mc", "td"]
+QTarget = Literal["privileged", "mc", "td"]
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,12 @@ class LossConfig:
     """Weight of the termination cross-entropy."""
     value: float = bounded(20.0, least=0)
     """Weight of the value loss on filtered states, in standard deviations of the return."""
-    q_target: QTarget = "mc"
-    """Target of Q. mc: Monte Carlo return; td: r + gamma Q'(h', z', a') with the next action of the
-    data, 0 instead of Q' after a failure."""
+    q_target: QTarget = "privileged"
+    """Target of Q. privileged: the return expected by a network that is fitted beforehand and sees
+    the position of the task's object (mc if the data lacks it); mc: Monte Carlo return; td:
+    r + gamma Q'(h', z', a') with the next action of the data, 0 instead of Q' after a failure."""
+    sampled_actions: int = bounded(3, least=0, most=1000)
+    """privileged: actions per row to which Q is fitted besides the recorded one."""
     td_decay: float = bounded(0.98, least=0, below=1)
     """td: decay per step of the target network Q'; 0: no target network."""
     imagined_steps: int = bounded(1, least=0, most=_FARTHEST)
@@ -74,6 +77,11 @@ class LossConfig:
     autoregressive_steps: int = bounded(8, least=1, most=_FARTHEST)
     """Steps over which predictions are fed back under `dynamics=autoregressive`, from every
     `multistep_stride`-th row."""
+    object: float = bounded(10.0, least=0)
+    """Weight of the position and velocity of the task's object, decoded from (h, z) where the data
+    has them, mean over the six standardised values; 0: none."""
+    multistep_object: float = bounded(10.0, least=0)
+    """Weight of the same on states imagined several steps ahead; 0: none."""
     reward: float = bounded(0.0, least=0)
     """Weight of the reward prediction from (h, z, a), squared error in standard deviations of the
     return; 0: no reward head."""
@@ -112,6 +120,10 @@ class WorldModelConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
 
+    def without_object(self) -> Self:
+        """The same without a decoder of the object's position."""
+        return replace(self, loss=replace(self.loss, object=0.0, multistep_object=0.0))
+
 
 def require_longer(window: int, steps: int, flag: str) -> None:
     """Raise `UsageError`, which names the ``flag`` of the window, if predictions would be fed back
@@ -134,9 +146,12 @@ PAPER_LOSS = LossConfig(
     kl_posterior=1.0,
     free_nats=0.0,
     value=1.0,
+    q_target="mc",
     imagined_steps=0,
     multistep_depth=0.0,
     multistep_state=0.0,
+    object=0.0,
+    multistep_object=0.0,
 )
 
 PRESETS = {

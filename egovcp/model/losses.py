@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from egovcp import spec
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness
 from egovcp.model.fused_recurrence import filter_window
@@ -39,6 +40,17 @@ class Batch(NamedTuple):
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
     reward: Tensor  # (B, T), after a_t
+    privileged: Tensor  # (B, T, F), see `egovcp.data.privileged`
+
+    @property
+    def object(self) -> Tensor:
+        """(B, T, 6) position and velocity of the task's object, m and m/s, heading frame."""
+        return self.privileged[..., spec.OBJECT_STATE]
+
+    @property
+    def object_known(self) -> Tensor:
+        """(B, T) bool."""
+        return self.privileged[..., spec.OBJECT_KNOWN] > 0
 
 
 class Rollout(NamedTuple):
@@ -206,6 +218,18 @@ def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     prediction = model.decode_state(rollout.carry.h, rollout.carry.z).float()
     error = 0.5 * (prediction - rollout.state).square().mean(-1)
     return masked_mean(error, batch.valid)
+
+
+def object_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
+    """Gaussian negative log likelihood of position and velocity of the task's object."""
+    error = object_error(model, rollout.carry, batch.object)
+    return masked_mean(error, batch.valid & batch.object_known)
+
+
+def object_error(model: WorldModel, carry: Carry, state: Tensor) -> Tensor:
+    """Half the squared error of the standardised position and velocity (..., 6), mean, (...,)."""
+    error = model.standardised_object(carry) - model.standardise_object(state)
+    return 0.5 * error.square().mean(-1)
 
 
 def kl_losses(rollout: Rollout, valid: Tensor, config: LossConfig) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 Equation 8 compares prior and posterior one step ahead, where errors that grow over several steps
 are still small. These losses imagine several steps from some rows of a window, with the recorded
-actions, and compare the decoded images and proprioception with the recorded ones.
+actions, and compare the decoded images, proprioception and object position with the recorded ones.
 
 Autoregressive training does so at every step and replaces equation 8: from filtered states the
 model continues with its own predictions,
@@ -25,7 +25,14 @@ from torch import Tensor
 from egovcp.model.config import LossConfig
 from egovcp.model.fused_recurrence import imagine_window
 from egovcp.model.latent_state import Carry
-from egovcp.model.losses import Batch, Rollout, image_error, masked_mean, unbroken
+from egovcp.model.losses import (
+    Batch,
+    Rollout,
+    image_error,
+    masked_mean,
+    object_error,
+    unbroken,
+)
 from egovcp.model.world_model import WorldModel
 
 
@@ -38,10 +45,11 @@ class Imagined(NamedTuple):
 
 
 class _TermWeights(NamedTuple):
-    """Weights of the two terms."""
+    """Weights of the terms."""
 
     depth: float
     state: float
+    object: float
 
 
 def multistep_losses(
@@ -51,7 +59,7 @@ def multistep_losses(
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """Depth image and proprioception of states imagined ``multistep_horizons`` steps ahead.
+    """Decoded observations and object of states imagined ``multistep_horizons`` steps ahead.
 
     Args:
         model: the world model.
@@ -61,7 +69,7 @@ def multistep_losses(
         first: first row to imagine from, see `first_row`.
     """
     config = model.config.loss
-    weights = _TermWeights(config.multistep_depth, config.multistep_state)
+    weights = _TermWeights(config.multistep_depth, config.multistep_state, config.multistep_object)
     if not any(weights):
         return {}
     seen = imagine_ahead(model, rollout.carry, batch, config.multistep_horizons, first)
@@ -77,7 +85,7 @@ def autoregressive_losses(
 ) -> dict[str, Tensor]:
     """The same at each of ``autoregressive_steps`` steps, weighted like the reconstruction."""
     config = model.config.loss
-    weights = _TermWeights(config.depth, config.state)
+    weights = _TermWeights(config.depth, config.state, config.object)
     seen = imagine_ahead(model, rollout.carry, batch, autoregressive_horizons(config), first)
     return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
 
@@ -160,7 +168,7 @@ def _compare(
     weight: Tensor,
     weights: _TermWeights,
 ) -> dict[str, Tensor]:
-    """Terms ``NAME_depth`` and ``NAME_state`` of imagined states."""
+    """Terms ``NAME_depth``, ``NAME_state`` and, if decoded, ``NAME_object`` of imagined states."""
     if imagined is None:
         return {}
     carry, rows, known = imagined
@@ -169,7 +177,12 @@ def _compare(
     depth = image_error(image, near, weight[:, rows])
     predicted = model.decode_state(carry.h, carry.z).float()
     state = 0.5 * (predicted - rollout.state[:, rows]).square().mean(-1)
-    return {
+    terms = {
         f"{name}_depth": weights.depth * masked_mean(depth, known),
         f"{name}_state": weights.state * masked_mean(state, known),
     }
+    if weights.object > 0:
+        error = object_error(model, carry, batch.object[:, rows])
+        known = known & batch.object_known[:, rows]
+        terms[f"{name}_object"] = weights.object * masked_mean(error, known)
+    return terms

@@ -14,7 +14,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from egovcp.model import losses
 from egovcp.model.latent_state import Gaussian
@@ -25,8 +25,8 @@ from egovcp.model.multistep import (
     first_row,
     multistep_losses,
 )
-from egovcp.model.networks import SplitMlp
 from egovcp.model.parallel import SINGLE_PROCESS, current_rank, run_parallel
+from egovcp.model.privileged_value import sample_actions
 from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
 
@@ -41,6 +41,7 @@ class StepNoise(NamedTuple):
     image: int  # index of the first image that is decoded
     multistep: int  # first row from which `multistep_losses` imagines
     autoregressive: int  # the same for `autoregressive_losses`; 0 if unused
+    actions: Tensor  # (B, T, K, 7), sampled actions of the privileged value; K = 0 without it
 
 
 def sample_step_noise(
@@ -51,21 +52,19 @@ def sample_step_noise(
     noise = losses.latent_noise(model, batch, generator)
     multistep = first_row(config, config.multistep_horizons, batch, generator)
     image = losses.first_image(config.decode_every, batch, generator)
-    if model.config.dynamics == "joint":
-        return StepNoise(noise, image, multistep, 0)
-    return StepNoise(
-        noise,
-        image,
-        multistep,
-        first_row(config, autoregressive_horizons(config), batch, generator),
-    )
+    autoregressive = 0
+    if model.config.dynamics == "autoregressive":
+        autoregressive = first_row(config, autoregressive_horizons(config), batch, generator)
+    count = config.sampled_actions if config.q_target == "privileged" else 0
+    actions = sample_actions(batch.prev_action, count, generator)
+    return StepNoise(noise, image, multistep, autoregressive, actions)
 
 
 def world_model_loss(
     model: WorldModel,
     batch: Batch,
     noise: StepNoise | torch.Generator | None = None,
-    head: SplitMlp | None = None,
+    critic: nn.Module | None = None,
 ) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
 
@@ -73,11 +72,11 @@ def world_model_loss(
         model: the world model.
         batch: windows of episodes.
         noise: random numbers, or the generator that samples them; None: torch's default generator.
-        head: value head of the TD target (`egovcp.model.value_losses`); None: the model's.
+        critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
     """
     draws = noise if isinstance(noise, StepNoise) else sample_step_noise(model, batch, noise)
     rollout = losses.filter_sequence(model, batch, noise=draws.noise)
-    filtered, imagined = _term_groups(model, rollout, batch, draws, head)
+    filtered, imagined = _term_groups(model, rollout, batch, draws, critic)
     terms = filtered() | imagined()
     return _sum(terms), _named(terms)
 
@@ -86,7 +85,7 @@ def world_model_gradients(
     model: WorldModel,
     batch: Batch,
     draws: StepNoise,
-    head: SplitMlp | None = None,
+    critic: nn.Module | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms]:
     """`world_model_loss`, detached; the gradient replaces the ``grad`` of the model's parameters.
@@ -97,7 +96,7 @@ def world_model_gradients(
         model: the world model.
         batch: windows of episodes.
         draws: random numbers of the step.
-        head: value head of the TD target; None: the model's.
+        critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
         precision: context (autocast) of the losses, not of their gradients.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
@@ -113,9 +112,10 @@ def world_model_gradients(
             if not terms:
                 return terms, [None] * len(inputs)
             with torch.autocast(batch.state.device.type, enabled=False):
-                return terms, list(torch.autograd.grad(total, inputs, allow_unused=True))
+                gradients = torch.autograd.grad(total, inputs, allow_unused=True)
+                return terms, list(gradients)
 
-        filtered, imagined = _term_groups(model, leaves, batch, draws, head)
+        filtered, imagined = _term_groups(model, leaves, batch, draws, critic)
         first, second = partial(with_gradient, filtered), partial(with_gradient, imagined)
         # Data-parallel processes synchronise at every mean, so the order must be fixed.
         if batch.state.device.type == "cpu" and current_rank() is SINGLE_PROCESS:
@@ -136,7 +136,7 @@ def _term_groups(
     rollout: Rollout,
     batch: Batch,
     draws: StepNoise,
-    head: SplitMlp | None,
+    critic: nn.Module | None,
 ) -> tuple[TermGroup, TermGroup]:
     """The terms of filtered states, and those of states imagined several steps ahead."""
     config = model.config.loss
@@ -149,11 +149,15 @@ def _term_groups(
             "depth": config.depth * depth,
             "state": config.state * losses.state_loss(model, rollout, batch),
         }
+        if config.object > 0:
+            terms["object"] = config.object * losses.object_loss(model, rollout, batch)
         if model.config.dynamics == "joint":
             terms |= losses.kl_losses(rollout, batch.valid, config)
         else:
             terms |= autoregressive_losses(model, rollout, batch, weight, draws.autoregressive)
-        return terms | value_and_termination_losses(model, rollout, batch, config, head)
+        return terms | value_and_termination_losses(
+            model, rollout, batch, config, critic, draws.actions
+        )
 
     def imagined() -> Terms:
         return multistep_losses(model, rollout, batch, weight, draws.multistep)

@@ -1,15 +1,22 @@
 """Losses of the value, termination and reward heads (paper equations 9 and 7b).
 
-The target of Q is the Monte Carlo return, or with ``q_target="td"`` the one-step target
+The target of Q is set by ``q_target``:
 
-    y_t = r_t + gamma (1 - d_t) Q'(h_{t+1}, z_{t+1}, a_{t+1})
+* ``privileged``: the prediction of a value function that sees the position of the task's object
+  (`egovcp.model.privileged_value`), for the recorded action and for some sampled ones; where none
+  is given, as ``mc``;
+* ``mc``: the Monte Carlo return;
+* ``td``: the one-step target
 
-with the action that the data took next and d_t = 1 if a_t ended the episode in failure.
+      y_t = r_t + gamma (1 - d_t) Q'(h_{t+1}, z_{t+1}, a_{t+1})
+
+  with the action that the data took next and d_t = 1 if a_t ended the episode in failure.
 """
 
 from __future__ import annotations
 
 import copy
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +26,16 @@ from egovcp.model.config import LossConfig
 from egovcp.model.latent_state import Carry
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
 from egovcp.model.networks import SplitMlp
+from egovcp.model.privileged_value import PrivilegedValue
 from egovcp.model.world_model import WorldModel
+
+
+class ValueTargets(NamedTuple):
+    """What Q is fitted to at each row, for K actions."""
+
+    action: Tensor  # (B, T, K, 7), the recorded one first
+    value: Tensor  # (B, T, K) standardised
+    usable: Tensor  # (B, T) bool, whether the values are known
 
 
 class TargetNetwork(nn.Module):
@@ -63,22 +79,45 @@ def td_target(
     return batch.reward + model.discount * later, batch.valid & known
 
 
-def value_target(
-    model: WorldModel, carry: Carry, batch: Batch, head: SplitMlp | None = None
-) -> tuple[Tensor, Tensor]:
-    """Standardised target of Q at each row (B, T), and the rows (B, T) at which it is known.
+def value_targets(
+    model: WorldModel,
+    carry: Carry,
+    batch: Batch,
+    critic: nn.Module | None = None,
+    sampled: Tensor | None = None,
+) -> ValueTargets:
+    """Targets of Q at the rows of a batch.
 
     Args:
         model: the world model; its `LossConfig.q_target` selects the target.
         carry: the filtered states (B, T, ...).
         batch: the recorded windows.
-        head: value head of the TD target; None: the model's.
+        critic: the network that predicts the target: a `PrivilegedValue`, or the value head of the
+            TD target; None: returns, or the model's own head.
+        sampled: (B, T, K - 1, 7) further actions that the privileged value is asked for.
     """
-    if model.config.loss.q_target == "mc":
-        target, usable = batch.mc_return, batch.valid & batch.mc_valid
+    action = batch.action[:, :, None]
+    if isinstance(critic, PrivilegedValue):
+        if sampled is not None:
+            action = torch.cat([action, sampled], 2)
+        return privileged_targets(model, batch, critic, action)
+    if model.config.loss.q_target == "td":
+        assert critic is None or isinstance(critic, SplitMlp)
+        target, usable = td_target(model, carry, batch, critic)
     else:
-        target, usable = td_target(model, carry, batch, head)
-    return (target - model.return_mean) / model.return_std, usable
+        target, usable = batch.mc_return, batch.valid & batch.mc_valid
+    value = (target - model.return_mean) / model.return_std
+    return ValueTargets(action, value[..., None], usable)
+
+
+@torch.no_grad()
+def privileged_targets(
+    model: WorldModel, batch: Batch, critic: PrivilegedValue, action: Tensor
+) -> ValueTargets:
+    """The privileged value of actions (B, T, K, 7)."""
+    state = model.standardise(batch.state)[:, :, None]
+    value = critic(state, batch.privileged[:, :, None], action)
+    return ValueTargets(action, value, batch.valid)
 
 
 def value_and_termination_losses(
@@ -86,17 +125,19 @@ def value_and_termination_losses(
     rollout: Rollout,
     batch: Batch,
     config: LossConfig,
-    head: SplitMlp | None = None,
+    critic: nn.Module | None = None,
+    sampled: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Equations 9 and 7b, on the posterior and on states imagined from it.
 
     The planner evaluates Q on imagined states, so Q is also trained on them: the value of
     (h_{t+k}, z^_{t+k}), imagined from row t with the recorded actions, is fitted to the target of
-    row t + k. A reward head is trained on the same states.
+    row t + k. A reward head is trained on the same states. See `value_targets` for the other
+    arguments.
     """
-    target, usable = value_target(model, rollout.carry, batch, head)
-    error = model.value_error(rollout.carry, batch.action, target)
-    losses = {"value": config.value * masked_mean(error, usable)}
+    targets = value_targets(model, rollout.carry, batch, critic, sampled)
+    error = _value_error(model, rollout.carry, targets)
+    losses = {"value": config.value * masked_mean(error, targets.usable)}
     predicts_reward = model.reward_head is not None
     rewards: list[Tensor] = []
     if predicts_reward:
@@ -118,8 +159,9 @@ def value_and_termination_losses(
         carry = carry.map(lambda x: x[:, :-1])  # (B, T - k)
         if config.imagined_steps and k < length:
             same_episode = unbroken(batch, k)
-            error = model.value_error(carry, batch.action[:, k:], target[:, k:])
-            imagined.append(masked_mean(error, usable[:, k:] & same_episode))
+            later = ValueTargets(*(x[:, k:] for x in targets))
+            error = _value_error(model, carry, later)
+            imagined.append(masked_mean(error, later.usable & same_episode))
             if predicts_reward:
                 rewards.append(_reward_error(model, carry, batch, same_episode))
     if imagined:
@@ -127,6 +169,12 @@ def value_and_termination_losses(
     if rewards:
         losses["reward"] = config.reward * torch.stack(rewards).mean()
     return losses
+
+
+def _value_error(model: WorldModel, carry: Carry, targets: ValueTargets) -> Tensor:
+    """Mean loss (B, T) of Q over the actions of each row."""
+    state = carry.map(lambda x: x[:, :, None])
+    return model.value_error(state, targets.action, targets.value).mean(-1)
 
 
 def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:

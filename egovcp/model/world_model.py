@@ -16,6 +16,7 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import numpy as np
@@ -39,6 +40,9 @@ from egovcp.model.networks import (
 
 MIN_STATE_STD: Final = 0.02  # constants, such as the velocity command of a standing robot
 MIN_RETURN_QUANTILE: Final = 0.001
+#: Typical position and velocity of a task's object and their deviations, heading frame, m and m/s.
+OBJECT_MEAN: Final = (1.5, 0.0, 0.35, -0.5, 0.0, -0.1)
+OBJECT_STD: Final = (0.9, 0.25, 0.2, 1.5, 0.5, 1.0)
 
 
 class PosteriorHead(nn.Module):
@@ -63,6 +67,8 @@ class WorldModel(nn.Module):
     return_std: Tensor
     min_return: Tensor
     discount: Tensor
+    object_mean: Tensor
+    object_std: Tensor
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -81,6 +87,11 @@ class WorldModel(nn.Module):
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = self._value_head(value.width(c.value_loss))
         self.reward_head = self._value_head(1) if c.loss.reward > 0 else None
+        predicts_object = c.loss.object > 0 or c.loss.multistep_object > 0
+        with torch.random.fork_rng(devices=[]):  # the other weights start the same without it
+            self.object_head = (
+                SplitMlp(state, c.units, len(OBJECT_MEAN)) if predicts_object else None
+            )
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -88,6 +99,8 @@ class WorldModel(nn.Module):
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("min_return", torch.zeros(()))
         self.register_buffer("discount", torch.tensor(spec.GAMMA))
+        self.register_buffer("object_mean", torch.tensor(OBJECT_MEAN), persistent=False)
+        self.register_buffer("object_std", torch.tensor(OBJECT_STD), persistent=False)
 
     def _value_head(self, outputs: int) -> SplitMlp:
         c = self.config
@@ -252,6 +265,36 @@ class WorldModel(nn.Module):
             )
         r: Tensor = self.reward_head(carry.h, carry.z, action)
         return r.squeeze(-1).float()
+
+    def standardised_object(self, carry: Carry) -> Tensor:
+        """Standardised position and velocity of the task's object, (..., 6).
+
+        Raises:
+            UsageError: the model has no decoder of it, as a saved policy.
+        """
+        if self.object_head is None:
+            raise UsageError(
+                "this world model does not decode the object's position; only models in training "
+                "with loss.object or loss.multistep_object do"
+            )
+        state: Tensor = self.object_head(carry.h, carry.z)
+        return state.float()
+
+    def standardise_object(self, state: Tensor) -> Tensor:
+        """Position and velocity (..., 6), m and m/s -> typical values 0, deviations 1, clipped."""
+        return ((state - self.object_mean) / self.object_std).clamp(-5.0, 5.0)
+
+    def object_position(self, carry: Carry) -> Tensor:
+        """Position of the task's object in the heading frame, m, (..., 3)."""
+        state = self.standardised_object(carry) * self.object_std + self.object_mean
+        return state[..., :3]
+
+    def without_object_head(self) -> WorldModel:
+        """A copy without the decoder of the object's position, which only training uses."""
+        model = copy.deepcopy(self)
+        model.object_head = None
+        model.config = self.config.without_object()
+        return model
 
     def termination_logit(self, carry: Carry) -> Tensor:
         """Logit of the probability that the episode has failed here, (...,); equation 4."""

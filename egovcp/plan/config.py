@@ -50,12 +50,11 @@ class PlannerConfig:
     """Smallest sampling standard deviation, in units of eta."""
     eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
     """Largest action change per step, in units of the action box."""
-    hands_cost: float = bounded(0.05, least=0, most=1e6)
-    """Cost of hands away from the neutral pose: times the mean squared hand action, in units of
-    return."""
-    step_cost: float = bounded(0.2, least=0, most=1e6)
-    """Cost of action changes: times their mean square, where 1 is the largest change, in units of
-    return."""
+    action_rate_cost: float = bounded(spec.ACTION_RATE_COST, least=0, most=1e6)
+    """Cost of action changes per step, times their mean square, where 1 is the largest change; that
+    of the data's reward."""
+    pose_cost: float = bounded(spec.POSE_COST, least=0, most=1e6)
+    """Cost of the pose per step, times the mean squared action; that of the data's reward."""
     action_parameterization: ActionParameterization = "target"
     """How a sample becomes actions. target: move towards one target at rate eta, then hold it, like
     data collected with a longer --step_ticks; random_walk: an independent change at every step."""
@@ -93,12 +92,12 @@ class PlannerConfig:
         return self.horizon + (self.objective == "td")
 
 
-#: The paper's planner: 1024 random walks, 64 elites, no action cost, value 0 after a termination.
+#: The paper's planner: 1024 random walks, 64 elites, no action costs, value 0 after a termination.
 PAPER_PLANNER = PlannerConfig(
     samples=1024,
     elites=64,
-    hands_cost=0.0,
-    step_cost=0.0,
+    pose_cost=0.0,
+    action_rate_cost=0.0,
     action_parameterization="random_walk",
     termination_rule="paper",
 )

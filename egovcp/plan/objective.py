@@ -45,7 +45,7 @@ class Dynamics[L](Protocol):
         ...
 
     def imagine(self, carry: L, action: Tensor) -> L:
-        """Advance by one tick under action (E, M, 7)."""
+        """Advance by one step under action (E, M, 7)."""
         ...
 
     def value(self, carry: L, action: Tensor) -> Tensor:
@@ -58,11 +58,7 @@ class Dynamics[L](Protocol):
 
 
 def _with_rewards(model: Any) -> Any:
-    """``model``, which must have ``discount`` and ``reward(carry, action)``.
-
-    Raises:
-        UsageError: it has not.
-    """
+    """Return ``model``; raises `UsageError` without ``discount`` and ``reward(carry, action)``."""
     if not (hasattr(model, "reward") and hasattr(model, "discount")):
         raise UsageError(
             f"{type(model).__name__} has no reward and discount; plan with objective=value"
@@ -103,8 +99,8 @@ class ReferenceEvaluator[L](NamedTuple):
 class ReturnAccumulator:
     """Accumulates J of plans step by step, and selects the head that each step needs.
 
-    A failed plan has the value ``floor``, or the reward (1 - gamma) floor at each tick, whose
-    discounted sum is the floor. So a failure at tick j contributes gamma^j floor for any horizon.
+    A failed plan has the value ``floor``, or the reward (1 - gamma) floor at each step, whose
+    discounted sum is the floor. So a failure at step j contributes gamma^j floor for any horizon.
 
     Args:
         config: objective and termination rule.

@@ -1,4 +1,4 @@
-"""The searches: cross-entropy method, iCEM, MPPI and random shooting."""
+"""Optimisers of plans: cross-entropy method, iCEM, MPPI and random shooting."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class ImprovedCrossEntropy:
 
 
 def keep_best(state: SearchState, elites: Tensor, top: Tensor) -> SearchState:
-    """The state with these elites, whose first is the answer if it beats the one before."""
+    """The state with these elites; its result is the first of them if that is the best so far."""
     better = top[:, 0] > state.value
     mean = torch.where(better[:, None, None], elites[:, 0], state.mean)
     value = torch.where(better, top[:, 0], state.value)
@@ -215,7 +215,7 @@ def weights(values: Tensor, temperature: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Shooting:
-    """Random shooting: uniform steps, as in the data; keeps the best plan."""
+    """Random shooting: uniform deltas, as in the data; the result is the best plan so far."""
 
     config: PlannerConfig
 
@@ -242,9 +242,9 @@ OPTIMISERS: Final[Mapping[OptimiserName, Callable[[PlannerConfig], Optimiser]]] 
 
 
 def optimiser_of(config: PlannerConfig, device: torch.device | str = "cpu") -> Optimiser:
-    """The search that ``config.optimiser`` names.
+    """The optimiser that ``config.optimiser`` names.
 
-    On a CPU, if the backend may be int8, the kernel computes cem.
+    On a CPU, if the backend may be int8, cem is computed by the kernel.
     """
     wants_kernel = config.optimiser == "cem" and config.backend in ("auto", "int8")
     if wants_kernel and torch.device(device).type == "cpu" and _kernel_is_available():

@@ -30,7 +30,7 @@ _NONE: Final[Array] = np.zeros(0, np.float32)
 
 
 class PolicyStep(NamedTuple):
-    """Result of a planner tick for E robots; fields that a policy does not compute are empty."""
+    """Result of a planner step for E robots; fields that a policy does not compute are empty."""
 
     action: Array  # (E, 7) in [-1, 1]
     plan: Array = _NONE  # (E, N, 7)
@@ -43,10 +43,10 @@ class PolicyStep(NamedTuple):
 
 
 class Policy:
-    """Filters observations and plans for E robots; call `act`, then `advance`, once per tick.
+    """Filters observations and plans for E robots; call `act`, then `advance`, once per step.
 
     If a robot's state is not finite or exceeds `LARGEST_STATE`, its observation is skipped and the
-    prior predicts this tick. Depth that is not finite counts as invalid (0).
+    prior predicts this step. Depth that is not finite counts as invalid (0).
 
     The recurrence advances with the action that was sent, after the safety layer: pass it to
     `advance`. The model's weights are packed at the first plan; later changes are not seen.
@@ -111,7 +111,7 @@ class Policy:
         self.skipped = ~usable.cpu().numpy()
 
     def _predicted(self, carry: Carry, first: Tensor) -> Carry:
-        """The carry at this tick without its observation; from zeros where ``first`` (E,)."""
+        """The carry at this step without its observation; from zeros where ``first`` (E,)."""
         start = _choose_rows(first, self.model.initial(self.num_envs), carry)
         return self.model.imagine(start, self._sent.masked_fill(first[:, None], 0.0))
 

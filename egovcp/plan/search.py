@@ -20,7 +20,7 @@ from egovcp.plan.objective import PlanEvaluator
 
 
 def reflect_once(x: Tensor) -> Tensor:
-    """`egovcp.spec.reflect` of values within [-3, 3], with the bits of the kernel."""
+    """`egovcp.spec.reflect` of values within [-3, 3]; bit-identical to the kernel."""
     return 2.0 * x.clamp(-1.0, 1.0) - x
 
 
@@ -34,20 +34,20 @@ def random_walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
     return torch.stack(actions, -2)
 
 
-def target_steps(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Steps (..., N, 7) that move from ``start`` (..., 7) to one target at rate ``eta``, then stop.
+def target_deltas(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    """Deltas (..., N, 7) that move from ``start`` (..., 7) to one target at rate ``eta``, and hold.
 
-    The target is where ``deltas`` (..., N, 7) add up to, reflected into the box. Steps that are
+    The target is where ``deltas`` (..., N, 7) add up to, reflected into the box. Deltas that are
     already of this kind are returned unchanged.
     """
     target = reflect_once((start + eta * deltas.sum(-2)).clamp(-3.0, 3.0))
     far = ((target - start) / eta)[..., None, :]
-    ticks = torch.arange(deltas.shape[-2], dtype=far.dtype, device=far.device)[:, None]
-    return (far.abs() - ticks).clamp(0.0, 1.0) * far.sign()
+    steps = torch.arange(deltas.shape[-2], dtype=far.dtype, device=far.device)[:, None]
+    return (far.abs() - steps).clamp(0.0, 1.0) * far.sign()
 
 
 def shift(deltas: Tensor) -> Tensor:
-    """Drop the executed first step of (E, N, 7) and append a zero: the warm start."""
+    """Drop the executed first one of deltas (E, N, 7) and append a zero: the warm start."""
     return torch.cat([deltas[:, 1:], torch.zeros_like(deltas[:, :1])], 1)
 
 
@@ -56,9 +56,9 @@ class SearchState(NamedTuple):
 
     mean: Tensor  # (E, N, 7) deltas of the present result
     std: Tensor  # (E, N, 7)
-    elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last round
-    values: Tensor  # (E, elites); -inf where J was not a number
-    value: Tensor  # (E,) J of the result less its action costs, as far as known
+    elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last iteration
+    values: Tensor  # (E, elites); -inf where J was not finite
+    value: Tensor  # (E,) J of the result, as far as known
 
 
 class Optimiser(Protocol):
@@ -69,7 +69,7 @@ class Optimiser(Protocol):
         ...
 
     def update(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
-        """Update from the ``values`` (E, M) of candidates; -inf where J was not a number."""
+        """Update from the ``values`` (E, M) of candidates; -inf where J was not finite."""
         ...
 
 
@@ -78,7 +78,7 @@ class FastRandomWalk(Protocol):
     """An optimiser with its own implementation of `random_walk`."""
 
     def random_walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-        """As the module function, with the same bits: (E, M, N, 7) from (E, 1, 7)."""
+        """As the module function, bit-identical: (E, M, N, 7) from (E, 1, 7)."""
         ...
 
 
@@ -86,10 +86,10 @@ class Plan(NamedTuple):
     """Result of a search for E robots."""
 
     actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
-    deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
-    value: Tensor  # (E,) J less action costs (cem: mean of the elites); -inf: none finite
-    candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
-    candidate_values: Tensor  # (E, elites); -inf where J was not a number
+    deltas: Tensor  # (E, N, 7) its deltas; shifted, the warm start of the next plan
+    value: Tensor  # (E,) J (cem: mean of the elites); -inf: none finite
+    candidates: Tensor  # (E, elites, N, 7) elites of the last iteration, best first
+    candidate_values: Tensor  # (E, elites); -inf where J was not finite
     iterations: int
 
 
@@ -132,6 +132,9 @@ def make_plan[C](
 ) -> Plan:
     """Plan for E robots from ``carry`` (E, ...), a_{t-1} = ``executed`` (E, 7).
 
+    Maximises J = evaluator's value - `action_costs`, known terms of the reward that Q does not
+    learn.
+
     Args:
         warm: (E, N, 7) deltas of the previous plan, already shifted; None: zeros.
         generator: of the samples, which all robots share: a robot's plan does not depend on the
@@ -147,9 +150,9 @@ def make_plan[C](
     for iteration in range(config.iterations):
         deltas = optimiser.propose(state, iteration, generator)  # (E, M, N, 7)
         if config.action_parameterization == "target":
-            deltas = target_steps(start, deltas, config.eta)
+            deltas = target_deltas(start, deltas, config.eta)
         actions = walk(start, deltas, config.eta)
-        values = _less_costs(plan_value(actions, generator), actions, deltas, config)
+        values = plan_value(actions, generator) - action_costs(start, actions, config)
         values = values.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         state = optimiser.update(state, deltas, values)
         if not deadline.allows_iteration():
@@ -159,21 +162,26 @@ def make_plan[C](
     return Plan(chosen, state.mean, state.value, best, state.values, iteration + 1)
 
 
-def _less_costs(values: Tensor, actions: Tensor, deltas: Tensor, config: PlannerConfig) -> Tensor:
-    """J (E, M) less the costs of pose and action changes of plans (E, M, N, 7)."""
-    cost: Tensor | float = 0.0
-    if config.hands_cost > 0:
-        cost = config.hands_cost * actions[..., spec.ACTION_HANDS].square().mean((-2, -1))
-    if config.step_cost > 0:
-        cost = cost + config.step_cost * deltas.square().mean((-2, -1))
-    return values - cost if isinstance(cost, Tensor) else values
+def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tensor:
+    """Discounted costs (E, M) of poses and action changes in plans (E, M, A, 7) from a_{t-1}
+    (E, 1, 7), over the horizon N:
+
+    sum_{k<N} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
+    """
+    actions = actions[..., : config.horizon, :]
+    before = torch.cat([start[:, None].expand_as(actions[..., :1, :]), actions[..., :-1, :]], -2)
+    change = (actions - before) / spec.ACTION_RATE_LIMIT
+    per_step = config.pose_cost * actions.square().mean(-1)
+    per_step = per_step + config.action_rate_cost * change.square().mean(-1)
+    discount = spec.GAMMA ** torch.arange(config.horizon, device=actions.device)
+    return (per_step * discount).sum(-1)
 
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> SearchState:
     robots = executed.shape[0]
     shape = (robots, config.actions, spec.ACTION_DIM)
     mean = executed.new_zeros(shape) if warm is None else warm
-    nothing = executed.new_full((robots, config.elites), -torch.inf)
+    unknown = executed.new_full((robots, config.elites), -torch.inf)
     elites = mean[:, None].expand(-1, config.elites, -1, -1)
     std = torch.full_like(mean, 3.0**-0.5)  # of U(-1, 1)
-    return SearchState(mean, std, elites, nothing, nothing[:, 0])
+    return SearchState(mean, std, elites, unknown, unknown[:, 0])

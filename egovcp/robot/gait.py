@@ -41,7 +41,7 @@ _KP: Final = STIFFNESS[:NU]
 class GaitConfig:
     """Timing, footholds and gains of the steps; part of the controller's identity.
 
-    The numbers were found by CMA-ES (as ``egovcp-tune-gait`` does it).
+    The numbers were found by CMA-ES.
     """
 
     step_time: float = 0.31

@@ -7,9 +7,10 @@ steps of 5 ms under the joint targets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -18,10 +19,8 @@ from numpy.typing import NDArray
 from egovcp.errors import UsageError
 from egovcp.robot.controllers import LowLevelController, absolute_controller, make_controller
 from egovcp.sim.camera import RayCastCamera
-from egovcp.sim.config import EnvConfig
 from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import build_scene
 from egovcp.sim.tasks.base import Solid
 from egovcp.spec import (
     ACTION_BOX,
@@ -30,9 +29,14 @@ from egovcp.spec import (
     COMMAND_SLICE,
     CONTROLLER_TICKS_PER_PLAN,
     DEPTH_COLS,
+    DEPTH_MAX_M,
     DEPTH_ROWS,
+    OBJECT_DIM,
     STATE_DIM,
 )
+
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
 
 Array = NDArray[np.float64]
 
@@ -47,22 +51,19 @@ class PrivilegedState:
     task: tuple[str, ...]  # (B,) the current task; in a sequence it changes
     time: Array  # (B,) s since the start of the episode
     since_event: Array
-    """(B,) s since throw, push or start of the arch; negative before, -inf if there is none."""
+    """(B,) s since the event of the task; negative before, -inf if there is none."""
     pelvis_w: Array  # (B, 7) position m, quaternion wxyz
     pelvis_velocity_w: Array  # (B, 3) m/s
     joint_position: Array  # (B, J) rad, without sensor noise
     joint_velocity: Array  # (B, J) rad/s, without sensor noise
     hands_b: Array  # (B, 2, 3) palm sites, m
-    object_w: Array
-    """(B, 3) ball centre (NaN before the throw), point of the wall nearest to the pelvis'
-    x axis, or arch centre on the ground, m."""
+    object_w: Array  # (B, 3) position of the task's object, m; NaN: there is none
     object_b: Array  # (B, 3) the same, m
     object_velocity_w: Array  # (B, 3) m/s
     object_velocity_b: Array
     """(B, 3) in the axes of the heading frame, not relative to the pelvis, m/s."""
-    object_size: Array  # (B,) ball radius or arch clearance, m; NaN for a wall
-    object_active: NDArray[np.bool_]
-    """(B,) ball in flight and untouched, push still felt, arch on the move."""
+    object_size: Array  # (B,) such as a radius, m; NaN: there is none
+    object_active: NDArray[np.bool_]  # (B,) the robot has to act now
     contact_force: Array
     """(B, parts) peak force between each of ``scene.PARTS`` and the object in the last
     planner tick, N."""
@@ -140,12 +141,15 @@ class StepResult:
     """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
 
 
-def resolve_config(config: EnvConfig) -> EnvConfig:
-    """``config`` with the values that depend on its low-level controller filled in.
+def resolve_config(config: EnvConfig, tasks: Iterable[str] = ()) -> EnvConfig:
+    """``config`` with the path of its controller's file made absolute.
 
-    See `EnvConfig.for_controller`. The path of a controller's file becomes absolute.
+    Raises:
+        UsageError: the controller does not suit one of ``tasks``.
     """
-    config = config.for_controller(make_controller(config.controller).walks)
+    walks = make_controller(config.controller).walks
+    for task in tasks:
+        config.require_walking(task, walks)
     return replace(config, controller=absolute_controller(config.controller))
 
 
@@ -156,7 +160,8 @@ class VectorEnv:
         render_depth: if false, depth images are zero, which is faster; all else is the same.
 
     Raises:
-        UsageError: unknown task, wrong shapes, or actions that are not numbers.
+        UsageError: unknown task, wrong shapes, actions that are not numbers, or a task that needs
+            a controller that walks, and another one.
     """
 
     def __init__(
@@ -172,11 +177,11 @@ class VectorEnv:
             )
         self.num_envs = num_envs
         self.controller = controller or make_controller(config.controller)
-        self.config = config = config.for_controller(self.controller.walks)
+        self.config = config
         self.instances: list[EnvInstance] = []
         self._camera = RayCastCamera(config.camera)
         self._render_depth = render_depth
-        self._standing = settle(build_scene("ball", config.feet), self.controller)
+        self._standing = settle(config, self.controller)
         self._pool = ThreadPoolExecutor(config.threads) if config.threads > 1 else None
         self._controller_state = np.zeros((num_envs, STATE_DIM))
         # newest first: sent actions that may not have taken effect yet
@@ -207,6 +212,7 @@ class VectorEnv:
         """Start an episode in every row."""
         if len(scenarios) != self.num_envs:
             raise UsageError(f"expected {self.num_envs} scenarios, found {len(scenarios)}")
+        self._require_walking(scenarios)
         if not self.instances:
             self.instances = [self._instance(scenario) for scenario in scenarios]
         else:
@@ -219,9 +225,14 @@ class VectorEnv:
             raise UsageError("reset_rows before the first reset; call reset first")
         if len(rows) != len(scenarios):
             raise UsageError(f"expected {len(rows)} scenarios, found {len(scenarios)}")
+        self._require_walking(scenarios)
         self._start_instances(rows, scenarios)
         which = np.asarray(rows, dtype=np.intp)
         return self._begin(which, which)
+
+    def _require_walking(self, scenarios: Sequence[Scenario]) -> None:
+        for scenario in scenarios:
+            self.config.require_walking(scenario.task, self.controller.walks)
 
     def _instance(self, scenario: Scenario) -> EnvInstance:
         return EnvInstance(self.config, self._camera, self._standing, scenario, self._render_depth)
@@ -292,7 +303,9 @@ class VectorEnv:
         return Observation(depth, state.astype(np.float32))
 
     def _result(self, terms: list[dict[str, float]]) -> StepResult:
-        names = dict.fromkeys(name for instance in self.instances for name in instance.task.terms)
+        names = dict.fromkeys(
+            name for instance in self.instances for name in instance.task.reward_terms
+        )
         by_name = {name: np.array([t.get(name, 0.0) for t in terms]) for name in names}
         return StepResult(
             observation=self._observe(),
@@ -322,6 +335,20 @@ class VectorEnv:
     def damp(self, row: int) -> None:
         """Damp the motors of ``row`` until its next episode."""
         self.instances[row].robot.damp()
+
+    def known_objects(self) -> NDArray[np.float32]:
+        """(B, 4) position of each task's object, m, heading frame, and 1; or zeros.
+
+        An object is known while it is in front of the pelvis within the range of the camera, and
+        still matters to the task.
+        """
+        found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
+        for row, instance in enumerate(self.instances):
+            robot, task = instance.robot, instance.task
+            position = (task.state().position_w - robot.data.qpos[:3]) @ robot.heading
+            if 0.0 < position[0] < DEPTH_MAX_M and not task.finished:  # false for NaN
+                found[row] = *position, 1.0
+        return found
 
     def privileged_state(self) -> PrivilegedState:
         """The simulator's state now, for oracles, probes and logs, never for a policy."""

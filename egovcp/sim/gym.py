@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController
-from egovcp.sim.config import EnvConfig
+from egovcp.sim import config as sim_config
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import task_names
 from egovcp.spec import (
     ACTION_DIM,
     DEPTH_COLS,
@@ -19,7 +20,6 @@ from egovcp.spec import (
     DEPTH_ROWS,
     PLANNER_HZ,
     STATE_DIM,
-    TASKS,
 )
 
 GymObservation = dict[str, NDArray[Any]]
@@ -41,13 +41,13 @@ class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
     def __init__(
         self,
         task: str,
-        config: EnvConfig | None = None,
+        config: sim_config.EnvConfig | None = None,
         controller: LowLevelController | None = None,
         seed: int = 0,
     ) -> None:
         self.metadata = {"render_modes": [], "render_fps": PLANNER_HZ}
         self._next = Scenario(task, seed, 0)
-        self._env = VectorEnv(config or EnvConfig(), 1, controller)
+        self._env = VectorEnv(config or sim_config.EnvConfig(), 1, controller)
         self.observation_space = gymnasium.spaces.Dict(
             {
                 "depth": gymnasium.spaces.Box(0, _MAX_MM, (DEPTH_ROWS, DEPTH_COLS), np.uint16),
@@ -94,8 +94,8 @@ def _first_row(observation: Observation) -> GymObservation:
 
 
 def register() -> None:
-    """Register ``egovcp/<task>-v0`` for every task; safe to call twice."""
-    for task in TASKS:
+    """Register ``egovcp/<task>-v0`` for every installed task; safe to call twice."""
+    for task in task_names(training=True):
         name = f"egovcp/{task}-v0"
         if name not in gymnasium.registry:
             gymnasium.register(name, entry_point="egovcp.sim.gym:EgovcpEnv", kwargs={"task": task})

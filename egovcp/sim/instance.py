@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import mujoco
 import numpy as np
@@ -14,12 +14,12 @@ from egovcp.errors import EnvironmentFailure, SimulationDiverged
 from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.stance_table import StandingPose, standing_pose
 from egovcp.sim.camera import DepthNoise, RayCastCamera, RayCaster
-from egovcp.sim.config import EnvConfig, RandomisationConfig, SensorConfig
+from egovcp.sim.config import RandomisationConfig, SensorConfig
 from egovcp.sim.robot import Proprioception, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import Scene, build_scene
-from egovcp.sim.tasks import make_task
 from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
+from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task
 from egovcp.spec import (
     ACTION_BOX,
     COMMAND_SLICE,
@@ -31,6 +31,9 @@ from egovcp.spec import (
     PHYSICS_STEPS_PER_CONTROLLER_TICK,
     STATE_DIM,
 )
+
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
 
 Array = NDArray[np.float64]
 
@@ -82,7 +85,11 @@ def initial_offset(config: RandomisationConfig, scenario: Scenario) -> NDArray[n
     return offset
 
 
-def settle(scene: Scene, controller: LowLevelController) -> StandingPose:
+def _scene(task: str, config: EnvConfig) -> Scene:
+    return build_scene(find_task(task).scene_tasks(config), config.feet)
+
+
+def settle(config: EnvConfig, controller: LowLevelController) -> StandingPose:
     """The pose in which episodes start: ``controller`` holds the neutral command for 2 s.
 
     The simulation is noiseless; the pelvis of the result is over the world's origin.
@@ -90,6 +97,7 @@ def settle(scene: Scene, controller: LowLevelController) -> StandingPose:
     Raises:
         EnvironmentFailure: the controller does not keep the robot standing.
     """
+    scene = _scene(DEFAULT_TASK, config)
     robot = SimulatedRobot(scene)
     start = standing_pose(ACTION_BOX.neutral[-1])
     start.position[:2] = 0.0
@@ -144,7 +152,7 @@ class EnvInstance:
         self._draw_sensors()
         self.physics = sample_physics(self._config.randomise, scenario)
         apply_physics(self.physics, self.robot.scene, self.robot.model)
-        self.task = make_task(self._config, scenario, self.robot)
+        self.task = find_task(scenario.task)(self._config, scenario, self.robot)
         self._task_parameters = self.task.parameters
         self._caster = RayCaster(self.robot.model, self.robot.index.torso_body)
         offset = initial_offset(self._config.randomise, scenario)
@@ -161,7 +169,7 @@ class EnvInstance:
 
     def _robot(self, task: str) -> SimulatedRobot:
         if task not in self._robots:
-            self._robots[task] = SimulatedRobot(build_scene(task, self._config.feet))
+            self._robots[task] = SimulatedRobot(_scene(task, self._config))
         return self._robots[task]
 
     def _draw_sensors(self) -> None:

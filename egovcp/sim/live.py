@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import DAMPING
 from egovcp.sim.camera import RayCastCamera
-from egovcp.sim.config import EnvConfig
 from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.robot import Proprioception, SimulatedRobot
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import PARTS, build_scene
+from egovcp.sim.scene import PARTS
 from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
 from egovcp.spec import (
     ACTION_BOX,
@@ -34,6 +33,9 @@ from egovcp.spec import (
     STATE_DIM,
     STATE_SLICES,
 )
+
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
 
 Array = NDArray[np.float64]
 
@@ -111,13 +113,19 @@ class LiveRobot:
 
     def __init__(self, config: EnvConfig) -> None:
         controller = make_controller(config.controller)
-        self.config = config.for_controller(controller.walks)
+        self.config = config
+        self._walks = controller.walks
         self._camera = RayCastCamera(config.camera)
-        self._standing = settle(build_scene("ball", config.feet), controller)
+        self._standing = settle(config, controller)
         self._instance: EnvInstance | None = None
 
     def start(self, scenario: Scenario) -> None:
-        """Hold the robot up in the scene of ``scenario``, with damped motors."""
+        """Hold the robot up in the scene of ``scenario``, with damped motors.
+
+        Raises:
+            UsageError: the task needs a controller that walks, and this one does not.
+        """
+        self.config.require_walking(scenario.task, self._walks)
         if self._instance is None:
             self._instance = EnvInstance(
                 self.config, self._camera, self._standing, scenario, render_depth=False

@@ -6,29 +6,19 @@ to all of them; only oracles read the simulator's privileged state.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Final, Literal, Protocol
+from collections.abc import Sequence
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.env import PrivilegedState, VectorEnv
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_ETA, reflect
+from egovcp.sim.tasks.registry import find_task
+from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
 
 Array = NDArray[np.float64]
-
-_GRAVITY: Final = np.array([0.0, 0.0, -9.81])
-_LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
-_BLOCK_AHEAD: Final = 0.32  # m, of the hand that waits for the ball from the pelvis
-_HAND_OFFSET: Final = (0.03, 0.0, 0.0)  # m, middle of the hand capsule from the palm site
-_PRESS: Final = 0.05  # m, hand targets behind the wall's surface
-_PRESS_ASIDE: Final = 0.20  # m, left and right
-_PRESS_HEIGHT: Final = 0.10  # m, above the pelvis
-_DUCK_FROM: Final = 0.75  # m, arch ahead of the pelvis
-_DUCK_UNTIL: Final = -0.30  # m
-_DUCK_HEIGHT: Final = 0.55  # m, of the pelvis
 
 
 class EnvPolicy(Protocol):
@@ -155,52 +145,17 @@ class RandomWalk:
         return rng.uniform(-1.0, 1.0, ACTION_DIM)
 
 
-def oracle_action(state: PrivilegedState, row: int) -> Array:
-    """(7,) the scripted solution of the current task of one row."""
-    return _ORACLES[state.task[row]](state, row)
-
-
-def _block_ball(state: PrivilegedState, row: int) -> Array:
-    """Put the nearer hand where the ball will cross a plane ahead of the body."""
-    if not state.object_active[row]:
-        return np.zeros(7)
-    t = _LOOKAHEAD[:, None]
-    path = state.object_b[row] + state.object_velocity_b[row] * t + 0.5 * _GRAVITY * t * t
-    point = path[np.argmin(np.abs(path[:, 0] - _BLOCK_AHEAD))]
-    target = np.asarray(ACTION_BOX.neutral).copy()
-    side = 0 if point[1] > 0 else 1
-    target[3 * side : 3 * side + 3] = point - _HAND_OFFSET
-    return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
-
-
-def _brace_on_wall(state: PrivilegedState, row: int) -> Array:
-    """After a push towards the wall, press both hands on it."""
-    if not state.object_active[row]:
-        return np.zeros(7)
-    ahead = state.object_b[row, 0] + _PRESS
-    left, right = (ahead, _PRESS_ASIDE, _PRESS_HEIGHT), (ahead, -_PRESS_ASIDE, _PRESS_HEIGHT)
-    target = np.array([*left, *right, ACTION_BOX.neutral[-1]])
-    return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
-
-
-def _duck_under_arch(state: PrivilegedState, row: int) -> Array:
-    """Squat while the arch is near."""
-    target = np.array(ACTION_BOX.neutral)
-    if state.object_active[row] and _DUCK_UNTIL < state.object_b[row, 0] < _DUCK_FROM:
-        target[6] = _DUCK_HEIGHT
-    return ACTION_BOX.to_normalised(target)
-
-
-_ORACLES: Final[dict[str, Callable[[PrivilegedState, int], Array]]] = {
-    "ball": _block_ball,
-    "wall": _brace_on_wall,
-    "arch": _duck_under_arch,
-}
-
-
 class Oracle(_Stateless):
-    """`oracle_action` of every row."""
+    """The scripted solution of the current task of every row, `Task.oracle`.
+
+    Raises:
+        UsageError: a task has none.
+    """
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        for task in dict.fromkeys(scenario.task for scenario in scenarios):
+            if not find_task(task).has_oracle():
+                raise UsageError(f"task {task} has no oracle; choose another controller")
 
     def act(self, env: VectorEnv) -> Array:
-        state = env.privileged_state()
-        return np.array([oracle_action(state, row) for row in range(env.num_envs)])
+        return np.array([instance.task.oracle() for instance in env.instances])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import mujoco
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.stance_table import StandingPose
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.scene import HEAD, TORSO, Scene, SceneIndex
+from egovcp.sim.scene import HEAD, TORSO, Contact, Scene, SceneIndex
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 Array = NDArray[np.float64]
@@ -38,14 +37,6 @@ MAX_SPEED: Final = 1000.0
 """Faster joints and bodies count as diverged, rad/s or m/s; the joints of the G1 reach 37 rad/s."""
 
 _LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floor
-
-
-@dataclass(frozen=True)
-class Contact:
-    """A contact of the robot with the task's object in one physics step."""
-
-    part: int  # Index into ``scene.PARTS``
-    force: float  # Normal force, N
 
 
 class SimulatedRobot:

@@ -1,4 +1,4 @@
-"""MuJoCo models of the tasks: robot, floor, and ball, wall or arch, or all of them.
+"""MuJoCo models of the tasks: robot, floor, and the objects of one task or of several.
 
 A model is compiled once per task and foot model; each simulated robot edits its own copy. Visual
 meshes are left out: rays and contacts use the collision capsules, so a copy has 80 kB, not 70 MB.
@@ -10,18 +10,20 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import FootModel, robot_spec
-from egovcp.sim.scenario import SEQUENCE
 from egovcp.spec import JOINT_NAMES
+
+if TYPE_CHECKING:
+    from egovcp.sim.tasks.base import Task
 
 _LOG = logging.getLogger(__name__)
 
@@ -31,11 +33,6 @@ if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(_LOG.debug)
 
 FLOOR: Final = "floor"
-BALL: Final = "ball"
-WALL: Final = "wall"
-ARCH: Final = "arch"
-ARCH_GEOMS: Final = ("arch_left_post", "arch_right_post", "arch_lintel")
-WALL_HALF_SIZE: Final = (0.05, 1.5, 1.3)  # m: thickness, width, height
 
 #: Parts of the robot that contacts distinguish. The hand includes the wrist, the torso the pelvis,
 #: the leg the foot; the arm is forearm and upper arm.
@@ -61,11 +58,20 @@ _PART_OF: Final = {
 
 
 @dataclass(frozen=True)
+class Contact:
+    """A contact of the robot with the task's object in one physics step."""
+
+    part: int  # Index into `PARTS`
+    force: float  # Normal force, N
+
+
+@dataclass(frozen=True)
 class SceneIndex:
     """Addresses inside a compiled model; constant over its copies."""
 
     part: NDArray[np.int8]  # (ngeom,) index into ``PARTS`` of a robot geom, -1 otherwise
-    is_object: NDArray[np.bool_]  # (ngeom,) ball, wall or arch
+    is_object: NDArray[np.bool_]  # (ngeom,) part of a task's object
+    objects: Mapping[str, tuple[int, ...]]  # Task -> geom ids of its objects
     floor: int  # Geom id of the floor
     foot_geoms: NDArray[np.intp]  # Geom ids of the feet
     robot_bodies: NDArray[np.intp]
@@ -90,19 +96,35 @@ class Scene:
 
 
 @cache
-def build_scene(task: str, feet: FootModel) -> Scene:
-    """The scene of ``task``, compiled once per process; that of a sequence holds all objects."""
+def build_scene(tasks: tuple[type[Task], ...], feet: FootModel) -> Scene:
+    """The scene with the objects of ``tasks``, compiled once per process.
+
+    Raises:
+        EnvironmentFailure: the objects of a task do not compile; the message names it.
+    """
     spec = robot_spec(feet)
     strip_visuals(spec)
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
-    objects = tuple(_ADD) if task == SEQUENCE else (task,)
-    for name in objects:
-        _ADD[name](spec)
     # unused; they would compute accelerations
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-    model = spec.compile()
+    objects: dict[str, set[str]] = {}  # task -> names of its bodies
+    known = {body.name for body in spec.bodies}
+    for task in tasks:
+        try:
+            task.add_objects(spec)
+            names = [body.name for body in spec.bodies]
+            if "" in names or len(set(names)) < len(names):
+                raise ValueError("each of its bodies needs a name of its own")
+            objects[task.name] = set(names) - known
+            known.update(names)
+            model = spec.compile() if task is tasks[-1] else None
+            if model is not None and model.nu != len(JOINT_NAMES):
+                raise ValueError("it adds actuators, which only the robot has")
+        except Exception as error:
+            problem = " ".join(str(error).split()) or type(error).__name__
+            raise task.error(f"its scene does not compile: {problem}") from error
     return Scene(model, _index(model, objects))
 
 
@@ -115,47 +137,22 @@ def strip_visuals(spec: mujoco.MjSpec) -> None:
         spec.delete(mesh)
 
 
-def _add_ball(spec: mujoco.MjSpec) -> None:
-    body = spec.worldbody.add_body(name=BALL, pos=[-20, 0, 1])
-    body.add_freejoint()
-    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    body.add_geom(name=BALL, type=sphere, size=[0.1, 0, 0], mass=0.25, contype=1, conaffinity=1)
-
-
-def _add_box(body: mujoco.MjsBody, name: str, size: list[float], **options: Any) -> None:
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    body.add_geom(name=name, type=box, size=size, contype=1, conaffinity=0, **options)
-
-
-def _add_wall(spec: mujoco.MjSpec) -> None:
-    body = spec.worldbody.add_body(name=WALL, mocap=True, pos=[20, 0, 0])
-    centre = [WALL_HALF_SIZE[0], 0, WALL_HALF_SIZE[2]]
-    _add_box(body, WALL, list(WALL_HALF_SIZE), pos=centre, priority=1)
-
-
-def _add_arch(spec: mujoco.MjSpec) -> None:
-    body = spec.worldbody.add_body(name=ARCH, mocap=True, pos=[20, 0, 0])
-    for name in ARCH_GEOMS:
-        _add_box(body, name, [0.1, 0.1, 0.1])
-
-
-#: The ball comes last: its free joint is the last joint of the model.
-_ADD: Final[dict[str, Callable[[mujoco.MjSpec], None]]] = {
-    ARCH: _add_arch,
-    WALL: _add_wall,
-    BALL: _add_ball,
-}
-
-
-def _index(model: mujoco.MjModel, objects: Sequence[str]) -> SceneIndex:
+def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex:
     names = [model.geom(i).name for i in range(model.ngeom)]
-    object_bodies = [model.body(name).id for name in objects]
+    owner = {model.body(body).id: task for task, own in objects.items() for body in own}
+    object_bodies = list(owner)
     bodies = [i for i in range(1, model.nbody) if i not in object_bodies]
     first = model.joint(JOINT_NAMES[0])
     qpos, qvel = int(first.qposadr[0]), int(first.dofadr[0])
     return SceneIndex(
         part=np.array([_part(name) for name in names], dtype=np.int8),
         is_object=np.isin(model.geom_bodyid, object_bodies),
+        objects={
+            task: tuple(
+                geom for geom, body in enumerate(model.geom_bodyid) if owner.get(body) == task
+            )
+            for task in objects
+        },
         floor=model.geom(FLOOR).id,
         foot_geoms=np.array([i for i, name in enumerate(names) if "_foot" in name]),
         robot_bodies=np.array(bodies),

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import draccus
 
 from egovcp.artifact import load_artifact
-from egovcp.cli import report_error, run_command
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError, suggest
 from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
+from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
-from egovcp_experiment.cell import Cell, in_order
 from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.local_runner import LocalRunner
@@ -27,27 +24,6 @@ from egovcp_experiment.ray_runner import RayRunner
 from egovcp_experiment.report import publish
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
-
-PROG: Final = "egovcp-experiment"
-_EPILOG: Final = (
-    "Writes NAME.json, NAME.md and NAME.html beside cells/ (results), work/ (datasets, models) and "
-    "logs/. Ctrl-C stops all cells cleanly; the same command goes on."
-)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = list(sys.argv[1:] if argv is None else argv)
-    if not args or args[0] in ("-h", "--help"):
-        echo(_help())
-        return 0 if args else UsageError.exit_code
-    name, *flags = args
-    if name not in EXPERIMENTS:
-        unknown = f"unknown experiment {name!r}{suggest(name, EXPERIMENTS)}"
-        return report_error(PROG, UsageError(unknown))
-    run = partial(execute, name=name, command=shlex.join([PROG, *args]))
-    prog = f"{PROG} {name}"
-    return run_command(ExperimentConfig, run, flags, prog=prog, epilog=_EPILOG, defaults=scale_of)
 
 
 def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
@@ -67,8 +43,11 @@ def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
     return encoded
 
 
-def execute(config: ExperimentConfig, name: str, command: str) -> None:
+def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
     """Run the missing cells and write the report, also after an interruption.
+
+    Args:
+        argv: the command line, with the name of the experiment as its second item.
 
     Raises:
         UsageError: an option is invalid, or results of other settings are stored.
@@ -77,15 +56,17 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     """
     config.check()
     require_given(config)
+    prog, name = argv[:2]
     experiment = EXPERIMENTS[name]
-    cells = in_order(experiment.cells(config))
+    cells = experiment.cells(config)
     store = CellStore(Path(config.output_dir))
     with store.locked(), closing(_runner(config)) as runner:
         scheduler = CellScheduler(cells, store, config.jobs, echo, runner)
         records = scheduler.records
         if config.backend == "local":
-            _require_packages([cell for cell in cells if cell.name not in records])
-        echo(f"{PROG} {name}: {len(cells)} cells, {len(records)} complete")
+            for command in dict.fromkeys(c.command for c in cells if c.name not in records):
+                require_packages("egovcp-experiment", command.shell_name, *command.packages)
+        echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete")
         try:
             scheduler.run()
         finally:
@@ -93,7 +74,7 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
             missing = [cell.name for cell in cells if cell.name not in records]
             report = experiment.report(config, complete)
             encoded = draccus.encode(config)
-            publish(store.folder, name, report, complete, missing, encoded, command)
+            publish(store.folder, name, report, complete, missing, encoded, shlex.join(argv))
     for line in report.shows:
         echo(f"- {line}")
     echo(f"report: {store.folder / name}.html, .md, .json")
@@ -129,25 +110,25 @@ def _naming(option: str) -> Iterator[None]:
         raise type(error)(f"{option}: {error}") from error
 
 
-def _require_packages(cells: Sequence[Cell]) -> None:
-    """Raise `EnvironmentFailure` if a command lacks an optional package."""
-    for command in dict.fromkeys(cell.command for cell in cells):
-        require_packages("egovcp-experiment", command.shell_name, *command.packages)
-
-
 def _runner(config: ExperimentConfig) -> RayRunner | LocalRunner:
     return RayRunner(config.ray, echo) if config.backend == "ray" else LocalRunner(config.jobs)
 
 
-def _help() -> str:
-    width = max(map(len, EXPERIMENTS))
-    listed = "\n".join(f"  {name:{width}}  {e.SUMMARY}" for name, e in EXPERIMENTS.items())
-    return (
-        f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--NAME=VALUE ...]\n\n"
-        f"Run one of the paper's experiments, cell by cell, and write its report.\n\n{listed}\n\n"
-        f"`{PROG} NAME --help` explains the options."
-    )
-
+COMMANDS: Final = CommandGroup(
+    "egovcp-experiment",
+    "Run one of the paper's experiments, cell by cell, and write its report.",
+    {
+        name: Subcommand(
+            f"{__name__}:execute", experiment.SUMMARY, defaults=scale_of, takes_argv=True
+        )
+        for name, experiment in EXPERIMENTS.items()
+    },
+    "--output_dir is required; --scale sets the defaults of all other options. "
+    "Writes NAME.json, NAME.md and NAME.html beside cells/ (results), work/ (datasets, models) and "
+    "logs/. Ctrl-C stops all cells cleanly; the same command goes on.",
+    noun="experiment",
+)
+main = COMMANDS.main
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -8,8 +8,9 @@ from typing import Final, Literal
 
 from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.errors import UsageError, suggest
-from egovcp.spec import TASKS
 
+#: The paper's tasks.
+TASKS: Final = ("ball", "wall", "arch")
 Scale = Literal["smoke", "small", "paper"]
 
 
@@ -164,7 +165,7 @@ class ExperimentConfig:
     most: int = bounded(0, least=0)
     """Run only the first variants, at most this many; 0: all."""
     scenes: tuple[str, ...] = ()
-    """Scene flags of both collection and evaluation, '[--env.controller=stance]'."""
+    """Scene flags of both collection and evaluation, '[--env.ball.shape=box]'."""
     data: DataConfig = field(default_factory=DataConfig)
     """Data."""
     train: TrainingConfig = field(default_factory=TrainingConfig)
@@ -222,8 +223,7 @@ def smoke() -> ExperimentConfig:
     return ExperimentConfig(
         scale="smoke",
         most=3,
-        scenes=(  # episodes of 1 to 2 s with the cheap controller
-            "--env.controller=stance",
+        scenes=(  # episodes of 1 to 2 s
             "--env.ball_episode.ticks=30",
             "--env.ball_episode.event_ticks=[2,4]",
             "--env.wall_episode.ticks=30",
@@ -265,16 +265,7 @@ def small() -> ExperimentConfig:
     100 paired episodes."""
     return ExperimentConfig(
         scale="small",
-        scenes=("--env.controller=stance",),
-        data=DataConfig(
-            EpisodesConfig(ball=5400, wall=4000, arch=870),
-            flags=(  # hands hold each target for a while; throws come early in an episode
-                "--eta=1",
-                "--step_ticks=[5,15]",
-                "--env.ball_episode.ticks=46",
-                "--env.ball_episode.event_ticks=[4,10]",
-            ),
-        ),
+        data=DataConfig(EpisodesConfig(ball=5400, wall=4000, arch=870)),
         train=TrainingConfig(
             max_minutes=10.0,
             compared_steps=1000,
@@ -291,7 +282,7 @@ def paper() -> ExperimentConfig:
     return ExperimentConfig(
         scale="paper",
         data=DataConfig(
-            EpisodesConfig(ball=3334, wall=3334, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
+            EpisodesConfig(ball=8334, wall=5000, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
         ),
         train=TrainingConfig(
             steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from egovcp.artifact import policy_folder, shipped_policies
 from egovcp_experiment.cell import (
     ARTIFACT,
     COLLECT,
@@ -90,7 +91,9 @@ class Grid:
         model = model or Model()
         policies = self.config.train.policies
         if task in policies and not model.flags:
-            return ExternalPath(policies[task])
+            path = policies[task]
+            shipped = path in shipped_policies()
+            return ExternalPath(str(policy_folder(path)) if shipped else path)
         return CellOutput(self.train(task, seed, model).name, ARTIFACT)
 
     def train(self, task: str, seed: int, model: Model, name: str = "") -> Cell:
@@ -107,14 +110,7 @@ class Grid:
         return self.add(Cell(name or f"train-{task}-{model.name}-s{seed}", TRAIN, flags))
 
     def play(self, task: str, seed: int, variant: Variant, trained_on: str = "") -> Cell:
-        """The planner in closed loop.
-
-        Args:
-            task: played task.
-            seed: of the training.
-            variant: model and planner flags.
-            trained_on: task of the model, or `ALL`; empty: the played task.
-        """
+        """The planner in closed loop; ``trained_on``: task of the model, empty: the played one."""
         trained_on = trained_on or task
         policy = self.model(trained_on, seed, variant.model)
         differs = variant.play or variant.model.flags or trained_on != task
@@ -134,14 +130,7 @@ class Grid:
         scene: Flags | None = None,
         controllers: Sequence[str] = REFERENCES,
     ) -> Cell:
-        """Controllers that need no model, on the planner's scenarios.
-
-        Args:
-            task: played task.
-            name: of the cell; empty: references-TASK.
-            scene: changed --env.* flags.
-            controllers: of egovcp-eval.
-        """
+        """Controllers that need no model, on the planner's scenarios in a changed ``scene``."""
         flags = {**self.scenarios(task), "controllers": ",".join(controllers), **(scene or {})}
         return self.add(Cell(name or f"references-{task}", PLAY, flags))
 

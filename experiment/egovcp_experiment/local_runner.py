@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -33,9 +33,10 @@ class CellExit:
     """A command that has ended."""
 
     code: int
-    """Its exit code."""
-    machine: Mapping[str, Any]
+    machine: Mapping[str, Any] = field(default_factory=dict)
     """Hardware that it ran on."""
+    error: str = ""
+    """Why it could not run; empty: see its log."""
 
 
 def versions() -> dict[str, str]:
@@ -117,7 +118,7 @@ class LocalRunner:
         return process
 
     def close(self) -> None:
-        """There is nothing to release."""
+        """Does nothing."""
 
 
 def _interrupt_at_end_of_input() -> None:

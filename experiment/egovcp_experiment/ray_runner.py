@@ -74,22 +74,19 @@ class RayRun:
         self._ray, self._result = ray, result
 
     def ended(self) -> CellExit | None:
-        """How it ended, or None.
-
-        Raises:
-            EnvironmentFailure: its node is gone, or cannot run it.
-        """
+        """How it ended, or None."""
         if not self._ray.wait([self._result], timeout=0)[0]:
             return None
         errors = self._ray.exceptions
         try:
             end: CellExit = self._ray.get(self._result)
         except errors.TaskCancelledError:
-            return CellExit(INTERRUPTED, {})
+            return CellExit(INTERRUPTED)
         except errors.RayTaskError as error:
-            raise EnvironmentFailure(str(error.cause)) from error
+            return CellExit(EnvironmentFailure.exit_code, error=str(error.cause))
         except errors.RayError as error:
-            raise EnvironmentFailure(f"its Ray worker or node is gone: {error}") from error
+            lost = f"its Ray worker or node is gone: {error}"
+            return CellExit(EnvironmentFailure.exit_code, error=lost)
         return end
 
     def interrupt(self) -> None:
@@ -103,10 +100,6 @@ class RayRun:
 
 class RayRunner:
     """Runs commands on the cluster, wherever there are free resources.
-
-    Args:
-        config: resources of a command.
-        log: called if no node is large enough.
 
     Raises:
         EnvironmentFailure: Ray is not installed, or the cluster cannot be reached.

@@ -103,11 +103,7 @@ def draw(
 ) -> Plot:
     """Draw with Matplotlib; equal names and drawings give equal files.
 
-    Args:
-        name: of the drawing.
-        caption: what it shows.
-        paint: draws on an empty `matplotlib.figure.Figure`.
-        size: width and height, inches.
+    ``paint`` gets an empty `matplotlib.figure.Figure` of this width and height, inches.
     """
     import matplotlib  # takes a second
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -137,12 +133,8 @@ def publish(
     """Write NAME.json, NAME.md with its drawings, and NAME.html.
 
     Args:
-        folder: output folder.
-        name: of the experiment.
-        report: findings.
-        records: results of the cells that it is made from.
+        records: results of the cells that the report is made from.
         missing: names of incomplete cells.
-        config: the configuration.
         command: command line that repeats the experiment.
     """
     notes = [_SMOKE] if config["scale"] == "smoke" else []

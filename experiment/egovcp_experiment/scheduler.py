@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import EnvironmentFailure
 from egovcp.workers import stop_on_signal
 from egovcp_experiment.cell import Cell, Record, in_order
 from egovcp_experiment.local_runner import INTERRUPTED, LocalProcess, LocalRunner
@@ -28,18 +28,12 @@ class _Running:
     run: LocalProcess | RayRun
     start: float
 
-    @property
-    def minutes(self) -> float:
-        return (time.monotonic() - self.start) / 60.0
-
 
 class CellScheduler:
     """Runs the cells of an experiment and stores their results.
 
     Args:
         cells: each after those it needs.
-        store: results.
-        jobs: cells that run at a time.
         log: called with each line of progress.
         runner: runs the commands; None: `LocalRunner`.
 
@@ -55,8 +49,6 @@ class CellScheduler:
         log: Callable[[str], None] = print,
         runner: LocalRunner | RayRunner | None = None,
     ) -> None:
-        if jobs < 1:
-            raise UsageError(f"--jobs={jobs}: expected at least 1")
         self._cells = in_order(cells)
         self._store, self._jobs, self._log = store, jobs, log
         self._runner = runner or LocalRunner(jobs)
@@ -127,31 +119,23 @@ class CellScheduler:
     def _collect(self) -> None:
         """Store the results of commands that have ended."""
         for running in list(self._running):
-            cell = running.cell
-            try:
-                end = running.run.ended()
-            except EnvironmentFailure as error:
-                self._running.remove(running)
-                self._fail(running, str(error))
-                continue
+            cell, end = running.cell, running.run.ended()
             if end is None:
                 continue
             self._running.remove(running)
-            if end.code == INTERRUPTED and self._stopping:
-                self._progress(cell, f"stopped after {running.minutes:.1f} min")
-            elif end.code != 0:
-                message = _last_line(self._store.log(cell)) or f"exit code {end.code}"
-                self._fail(running, message)
-            else:
+            minutes = (time.monotonic() - running.start) / 60.0
+            if end.code == 0:
                 date = datetime.now(UTC).isoformat(timespec="seconds")
-                facts = {"minutes": running.minutes, "date": date, **end.machine}
+                facts = {"minutes": minutes, "date": date, **end.machine}
                 record = self._store.save(cell, self.records, running.argv, facts)
                 self.records[cell.name] = record
-                self._progress(cell, f"done in {running.minutes:.1f} min")
-
-    def _fail(self, running: _Running, message: str) -> None:
-        self.failed[running.cell.name] = message
-        self._progress(running.cell, f"failed after {running.minutes:.1f} min: {message}")
+                self._progress(cell, f"done in {minutes:.1f} min")
+            elif end.code == INTERRUPTED and self._stopping:
+                self._progress(cell, f"stopped after {minutes:.1f} min")
+            else:
+                message = end.error or _last_line(self._store.log(cell))
+                self.failed[cell.name] = message = message or f"exit code {end.code}"
+                self._progress(cell, f"failed after {minutes:.1f} min: {message}")
 
     def _progress(self, cell: Cell, event: str) -> None:
         number = self._cells.index(cell) + 1

@@ -69,10 +69,7 @@ class CellStore:
         return self.folder / "logs" / f"{cell.name}.log"
 
     def load(self, cell: Cell, known: Mapping[str, Record]) -> Record | None:
-        """The result of a cell, or None.
-
-        Args:
-            known: results of the cells that it needs.
+        """The result of a cell, or None; ``known`` are those of the cells that it needs.
 
         Raises:
             UsageError: the stored result has other settings.

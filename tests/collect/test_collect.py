@@ -10,8 +10,9 @@ from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.committer import Committer
 from egovcp.errors import DataError
+from egovcp.sim.tasks import task_names
 from egovcp_collect.collect import main
-from egovcp_collect.config import CollectConfig, MixConfig
+from egovcp_collect.config import CollectConfig
 from egovcp_collect.worker_pool import WorkerPool
 
 _SHORT = ["--env.ball_episode.ticks=6", "--env.ball_episode.event_ticks=[0,1]"]
@@ -57,11 +58,26 @@ def test_a_row_holds_the_observation_before_its_action(collected: Path) -> None:
         assert np.abs(steps).max() > 0.5 * spec.ACTION_ETA
 
 
+def test_rows_hold_reward_terms_and_the_object(collected: Path) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(collected)))
+    for index in range(4):
+        episode = reader.read(index)
+        np.testing.assert_allclose(episode.reward_terms.sum(1), episode.reward, atol=1e-5)
+        assert (episode.reward_terms[:, spec.REWARD_TERMS.index("pose")] < 0).all()
+        event, known = episode.metadata["event_tick"], episode.object[:, 3] > 0
+        thrown = np.arange(6) > (6 if event is None else event)
+        np.testing.assert_array_equal(known, thrown)  # the ball is thrown in the event's tick
+        assert (episode.object[~known] == 0).all()
+        ahead = episode.object[known, 0]
+        assert (np.diff(ahead) < 0).all()  # it comes nearer
+        assert ((ahead > 0.5) & (ahead < 3.5)).all()
+
+
 def test_the_command_and_its_configuration_are_recorded(collected: Path) -> None:
     recorded = json.loads((collected / "meta/collection.json").read_text())
     assert recorded["seed"] == 3
     assert recorded["command"].startswith("egovcp-collect ")
-    assert recorded["config"]["eta"] == 0.32
+    assert recorded["config"]["eta"] == 1.0
     assert recorded["config"]["env"]["ball_episode"]["ticks"] == 6
     assert recorded["versions"]["mujoco"]
 
@@ -85,15 +101,18 @@ def test_the_last_line_reports_episodes_steps_and_speed(
     ("flags", "message"),
     [
         (["--task=bal"], "did you mean 'ball'"),
-        (["--task=sequence"], "choose from: all, arch, ball, wall"),
+        (["--task=sequence"], "only for evaluation"),
         (["--episodes=0"], "--episodes=0: expected at least 1"),
         (["--num_workers=-1"], "expected at least 0"),
         (["--seed=-1"], "expected at least 0"),
-        (["--eta=0.5"], "rate limit"),
+        (["--eta=0.5", "--step_ticks=[1,1]"], "rate limit"),
         (["--eta=1", "--step_ticks=[3,9]"], "at most 0.96"),
         (["--step_ticks=[9,4]"], "shortest <= longest"),
         (["--boundary=bounce"], "bounce"),
-        (["--task=all", "--mix.ball=0", "--mix.wall=0", "--mix.arch=0"], "weights"),
+        (["--task=ball,wall", "--mix={ball: 0, wall: 0}"], "weight above 0"),
+        (["--task=ball,wall", "--mix={arch: 2}"], "does not have this task"),
+        (["--task=all", "--env.controller=stance"], "'stance' does not walk"),
+        (["--task=arch", "--env.controller=stance"], "--env.controller=walk"),
         (["--episode=3"], "did you mean '--episodes'"),
         (["--dataset.revision=main"], "no meaning for a new dataset"),
     ],
@@ -177,10 +196,15 @@ def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> 
     assert "--dataset.repo_id" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("mix", [MixConfig(), MixConfig(3, 1, 0), MixConfig(0.2, 0.5, 0.3)])
-def test_every_prefix_has_the_shares_of_the_tasks(mix: MixConfig) -> None:
-    tasks = [s.task for s in CollectConfig(task="all", mix=mix, episodes=300).scenarios()]
-    weights = np.array([mix.ball, mix.wall, mix.arch])
+@pytest.mark.parametrize(
+    "mix", [{}, {"ball": 3.0, "arch": 0.0}, {"ball": 0.2, "wall": 0.5, "arch": 0.3}]
+)
+def test_every_prefix_has_the_shares_of_the_tasks(mix: dict[str, float]) -> None:
+    """The shares are of the steps: the more steps an episode has, the fewer of them there are."""
+    config = CollectConfig(task="all", mix=mix, episodes=300)
+    tasks = [s.task for s in config.scenarios()]
+    ticks = np.array([config.env.episode(task).ticks for task in task_names(training=True)])
+    weights = np.array([mix.get(task, 1.0) for task in task_names(training=True)]) / ticks
     for length in range(1, 301):
-        counts = np.array([tasks[:length].count(task) for task in spec.TASKS])
+        counts = np.array([tasks[:length].count(task) for task in task_names(training=True)])
         assert np.abs(counts - length * weights / weights.sum()).max() < 1.5

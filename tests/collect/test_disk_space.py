@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from egovcp import spec
 from egovcp.data import open_dataset
 from egovcp.data.committer import work_folder
 from egovcp.data.metadata import verify_hashes
@@ -17,12 +16,13 @@ from egovcp.data.staging import StagedEpisode, encode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks import task_names
 from egovcp.testing import random_episode
 from egovcp_collect import collect
 from egovcp_collect.collect import main
 from egovcp_collect.worker_pool import WorkerPool
 
-_SCENARIOS = [Scenario(task, 0, i) for i, task in enumerate((*spec.TASKS, "ball"))]
+_SCENARIOS = [Scenario(task, 0, i) for i, task in enumerate((*task_names(training=True), "ball"))]
 
 
 def _free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:

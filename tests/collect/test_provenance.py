@@ -39,25 +39,6 @@ def test_controllers_are_compared_by_id() -> None:
         require_compatible(replace(now, controller_id="stance"), before)
 
 
-@pytest.mark.parametrize("task", ["wall", "all"])
-def test_a_missing_guard_cost_counts_as_zero(task: str) -> None:
-    now = provenance(task)
-    older: dict[str, Any] = copy.deepcopy(dict(now.config))
-    del older["env"]["wall"]["guard_cost"]
-    with pytest.raises(UsageError, match=r"--env\.wall\.guard_cost was 0\.0, is 0\.27"):
-        require_compatible(now, replace(now, config=older))
-    free = copy.deepcopy(dict(now.config))
-    free["env"]["wall"]["guard_cost"] = 0.0
-    require_compatible(replace(now, config=free), replace(now, config=older))
-
-
-def test_a_missing_guard_cost_does_not_matter_without_walls() -> None:
-    now = provenance("ball")
-    older: dict[str, Any] = copy.deepcopy(dict(now.config))
-    del older["env"]["wall"]["guard_cost"]
-    require_compatible(now, replace(now, config=older))
-
-
 def test_only_options_of_the_collected_task_are_listed() -> None:
     before, other = provenance("ball"), copy.deepcopy(dict(provenance("ball").config))
     other["env"]["wall"]["push_speed_range"] = [0.1, 0.2]

@@ -51,10 +51,9 @@ def _commands() -> Iterator[ListedCommand]:
         if not entry.name.startswith("egovcp-"):
             continue
         module = importlib.import_module(entry.load().module)
-        names = (
-            list(getattr(module, "SUBCOMMANDS", ())) or list(getattr(module, "EXPERIMENTS", ()))[:1]
-        )
-        for name in names or [""]:
+        group = getattr(module, "COMMANDS", None)
+        names = [""] if group is None else list(group.subcommands)
+        for name in names[:1] if entry.name == "egovcp-experiment" else names:
             arguments = (name,) if name else ()
             with mock.patch("egovcp.cli.parse_config", side_effect=_ParsedError) as parse:
                 try:

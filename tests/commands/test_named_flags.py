@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,16 +24,17 @@ COMMON = {"--debug", "--help", "--version", "--config_path", "--name", "--group.
 FOREIGN = {"--bind", "--port", "--serve", "--web", "--expect", "--user"}
 APPLICATIONS = {
     "collect": ("egovcp-collect", "egovcp-dataset"),
-    "train": ("egovcp-train", "egovcp-push", "egovcp-export", "egovcp-eval-", "egovcp-tune"),
+    "train": ("egovcp-train", "egovcp-push", "egovcp-export", "egovcp-eval-"),
     "deploy": (
         *("egovcp-deploy", "egovcp-eval", "egovcp-compare", "egovcp-mcap", "egovcp-depth"),
-        "egovcp-fake",
+        *("egovcp-fake", "egovcp-demo", "egovcp-task"),
     ),
     "experiment": ("egovcp-",),
     "egovcp": ("egovcp-",),
 }
 
 
+@cache
 def _flags_of_programs(*prefixes: str) -> set[str]:
     """Flags of the commands whose names begin so."""
     return {
@@ -64,6 +66,7 @@ def _named(text: str, own: set[str]) -> Iterator[str]:
                     yield flag
 
 
+@cache
 def _help(main: object, arguments: tuple[str, ...], topic: str = "--help=all") -> str:
     printed = io.StringIO()
     with redirect_stdout(printed), pytest.raises(SystemExit):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,6 +37,16 @@ CASES = {
     "egovcp-dataset repair": (
         "DATA --output_dir=NEW",
         ("dataset.root", "records"),
+        ("output_dir", "json"),
+    ),
+    "egovcp-dataset delete": (
+        "DATA --episodes=[1] --output_dir=NEW",
+        ("dataset.root",),
+        ("output_dir", "json"),
+    ),
+    "egovcp-dataset split": (
+        'DATA --splits={"a":1} --output_dir=NEW',
+        ("dataset.root",),
         ("output_dir", "json"),
     ),
     "egovcp-dataset merge": (
@@ -73,9 +84,13 @@ CASES = {
         ("env.controller",),
         ("output_dir",),
     ),
-    "egovcp-tune-gait": ("--output_dir=NEW --minutes=0.01", (), ("output_dir",)),
     "egovcp-deploy": (
         f"--policy.path=POLICY --output_dir=NEW --episodes=1 {STANCE}",
+        ("policy.path", "env.controller"),
+        ("output_dir",),
+    ),
+    "egovcp-demo": (
+        f"--policy.path=POLICY --task=ball --output_dir=NEW {STANCE}",
         ("policy.path", "env.controller"),
         ("output_dir",),
     ),
@@ -86,6 +101,10 @@ CASES = {
     ),
     "egovcp-compare": ("--run=NEW --other=NEW", ("run", "other"), ()),
     "egovcp-fake-g1": (STANCE, ("env.controller",), ("json",)),
+    "egovcp-task list": ("", (), ()),
+    "egovcp-task check": ("ball --episodes=1", ("env.controller",), ("json",)),
+    "egovcp-task play": (f"ball --output_dir=NEW {STANCE}", ("env.controller",), ("output_dir",)),
+    "egovcp-task new": ("reach --output_dir=NEW", (), ("output_dir",)),
     "egovcp-mcap info": ("RECORDING", ("file",), ("json",)),
     "egovcp-mcap recover": ("RECORDING NEW", ("file",), ("output",)),
     "egovcp-mcap to-dataset": ("RECORDING --dataset.root=NEW", ("files",), ("dataset.root",)),
@@ -159,15 +178,32 @@ def test_every_command_is_listed() -> None:
     assert {c.prog for c in all_commands()} == CASES.keys() | without
 
 
-@pytest.mark.parametrize(
-    ("prog", "arguments", "inputs", "outputs"),
-    [*((prog, *case) for prog, case in CASES.items()), *MORE],
-)
+type BadFlags = list[tuple[str, str]]
+
+
+def _cases() -> Iterator[tuple[str, str, BadFlags]]:
+    """(program, its arguments, flags with bad paths).
+
+    The first command with an option is given every value; the others, which read the option with
+    the same code, a share of them, each another one.
+    """
+    commands = Counter[tuple[str, tuple[str, ...]]]()
+    for prog, arguments, inputs, outputs in [*((p, *case) for p, case in CASES.items()), *MORE]:
+        bad: BadFlags = []
+        for options, values, share in ((inputs, INPUTS, 4), (outputs, OUTPUTS, 3)):
+            for option in options:
+                earlier = commands[option, values]
+                commands[option, values] += 1
+                chosen = values[earlier % share :: share] if earlier else values
+                bad += [(option, value) for value in chosen if (option, value) not in VALID]
+        yield prog, arguments, bad
+
+
+@pytest.mark.parametrize(("prog", "arguments", "bad"), _cases())
 def test_a_bad_path_is_refused_before_work_starts(
     prog: str,
     arguments: str,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
+    bad: BadFlags,
     places: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -177,7 +213,7 @@ def test_a_bad_path_is_refused_before_work_starts(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)  # read at its import
     before = _contents(places)
     problems = []
-    for flag, value in _bad_flags(inputs, outputs):
+    for flag, value in map(_flag, bad):
         argv = [*command.arguments, *_arguments(arguments), f"{flag}={value}"]
         found = run_limited(lambda argv=argv: command.main(argv), SECONDS)
         if problem := _problem(command, flag, value, found):
@@ -197,17 +233,14 @@ def _arguments(text: str) -> list[str]:
     return text.replace("NEW", "new").split()
 
 
-def _bad_flags(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-    for options, values in ((inputs, INPUTS), (outputs, OUTPUTS)):
-        for option in options:
-            for value in values:
-                if (option, value) in VALID:
-                    continue
-                if option in ("others", "files"):
-                    value = f'["{value}"]'
-                elif option in ("data.roots", "train.policies"):
-                    value = f'{{ball: "{value}"}}'
-                yield f"--{option}", value
+def _flag(option_and_value: tuple[str, str]) -> tuple[str, str]:
+    """The flag of an option, and its value as a command line has it."""
+    option, value = option_and_value
+    if option in ("others", "files"):
+        value = f'["{value}"]'
+    elif option in ("data.roots", "train.policies"):
+        value = f'{{ball: "{value}"}}'
+    return f"--{option}", value
 
 
 def _problem(command: ListedCommand, flag: str, value: str, found: LimitedResult) -> str:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from egovcp.errors import DataError
-from egovcp.sim.scenario import EPISODE_TASKS, Scenario
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks import task_names
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.controllers import Action, grid, load_constants, search_constant
 from egovcp_deploy.options import held_out
@@ -37,7 +38,7 @@ class Landscape:
         return EpisodeScore(scenario.episode, 10, reward, reward > -1, False, [0.1])
 
 
-@pytest.mark.parametrize("task", EPISODE_TASKS)
+@pytest.mark.parametrize("task", task_names())
 @pytest.mark.parametrize("which", [0, 1, -1])
 def test_the_best_action_wins_under_noise_shared_by_all(task: str, which: int) -> None:
     best = grid(task)[which]
@@ -60,7 +61,7 @@ def test_candidates_play_the_same_scenarios_and_none_of_the_evaluation() -> None
     assert not evaluated & {scenario for _, scenario in land.played}
 
 
-@pytest.mark.parametrize("task", EPISODE_TASKS)
+@pytest.mark.parametrize("task", task_names())
 def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: str) -> None:
     actions = np.array(grid(task))
     assert np.abs(actions).max() <= 1.0

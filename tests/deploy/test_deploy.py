@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from egovcp.log.mcap_reader import read_recording
 from egovcp.sim import robot
-from egovcp.sim.config import STANDING_PUSHES
+from egovcp.sim.config import EnvConfig
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
 from egovcp_deploy.deploy import main
-from egovcp_deploy.robots import ActionResult
+from egovcp_deploy.robots.base import ActionResult
 from egovcp_deploy.robots.sim import SimRobot
 
 #: What ``auto`` may stand for.
@@ -138,7 +138,7 @@ def test_each_event_of_an_episode_is_logged_once(tmp_path: Path, artifact_dir: P
     events = [event for tick in ticks for event in tick.events]
     assert "ball thrown" in ticks[2].events
     assert len(set(events)) == len(events)
-    paid = {"block": "ball blocked by a hand", "hit": "ball hit the body"}
+    paid = {"block": "blocked by a hand", "hit": "body hit"}
     for term, text in paid.items():
         first = next((t for t in ticks if t.reward_terms[term] != 0), None)
         assert (text in events) == (first is not None)
@@ -146,7 +146,7 @@ def test_each_event_of_an_episode_is_logged_once(tmp_path: Path, artifact_dir: P
 
 
 def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None:
-    flags = ["--env.controller=stance", "--env.arch.distance_range=[0.6,0.6]"]
+    flags = ["--env.arch.distance_range=[0.8,0.8]", "--env.sequence.parts=[arch,ball]"]
     flags += ["--env.arch_episode.event_ticks=[2,2]", "--env.sequence.pause_ticks=5"]
     flags += ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]"]
     played = ["--task=sequence", "--controller=oracle", "--episodes=1", "--seed=3"]
@@ -154,10 +154,12 @@ def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None
     ticks = read_recording(tmp_path / "out" / "rollout-0.mcap").ticks
     assert [event for tick in ticks for event in tick.events] == [
         "passage begins",
-        "arch passed",
+        "passed",
         "ball thrown",
-        "ball blocked by a hand",
+        "blocked by a hand",
     ]
+    (row,) = json.loads((tmp_path / "out" / "deploy.json").read_text())["rollouts"]
+    assert row["parts"] == {"arch": True, "ball": True}
 
 
 def test_a_reference_needs_no_artifact_and_logs_no_plan(
@@ -175,15 +177,12 @@ def test_a_reference_needs_no_artifact_and_logs_no_plan(
     assert report["low_level_controller"].startswith("g1-stance")
 
 
-def test_the_resolved_environment_is_recorded(
-    tmp_path: Path, artifact_dir: Path, short: list[str]
-) -> None:
+def test_the_environment_is_recorded(tmp_path: Path, artifact_dir: Path, short: list[str]) -> None:
     out = tmp_path / "out"
     assert run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short) == 0
     report = json.loads((out / "deploy.json").read_text())
     env = report["config"]["env"]
-    assert env["arch"]["motion"] == "rail"
-    assert env["wall"]["push_speed_range"] == list(STANDING_PUSHES)
+    assert env["wall"]["push_speed_range"] == list(EnvConfig().wall.push_speed_range)
     assert read_recording(out / "rollout-0.mcap").info.config == report["config"]
 
 

@@ -14,12 +14,12 @@ from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
+from egovcp_deploy.pilot.pilot import HOLD_RATE
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import OperatorRequest, State
-from egovcp_deploy.robots import ActionResult, RobotObservation
+from egovcp_deploy.robots.base import ActionResult, RobotObservation
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.rollouts import LockstepRunner
-from egovcp_deploy.safety import HOLD_RATE
 from tests.support.sinks import MemorySink
 
 MS = 1_000_000

@@ -1,19 +1,52 @@
-"""Every fault, once, against the fake G1 over ZMQ.
+"""Faults of every kind, once, against the fake G1 over ZMQ.
 
-``benchmarks/live_faults.py`` repeats them on loaded cores and checks the times.
+``benchmarks/live_faults.py`` repeats all faults on loaded cores and checks the times.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 
+from egovcp.log.tick import MotorReadings
+from egovcp_deploy.robots.base import LowState
+from egovcp_deploy.robots.wire import MalformedMessage, decode_state, encode_state
 from tests.support.robots.fault_kinds import FAULTS, FaultKind, Reaction
 from tests.support.robots.fault_rig import FaultRig
 from tests.support.robots.fault_runs import DAMP_LIMIT_MS, run_fault
 
 _ATTEMPTS = 3  # a busy machine also delays sensors and planner
+
+#: States that are rejected before they are decoded completely, as "state: not JSON" is.
+MALFORMED = (
+    *("state: all torn", "state: empty messages", "state: another topic", "state: a JSON list"),
+    *("state: nested 30000 deep", "state: position NaN", "state: position Infinity"),
+    *("state: position 1e400", "state: position with 4000 digits", "state: position null"),
+    *("state: position a string", "state: position true", "state: no motors"),
+    *("state: 29 motor slots", "state: no IMU", "state: no mode machine"),
+    *("state: remote control not base64", "state: quaternion zero"),
+    "state: quaternion of length 2",
+)
+#: States that `PlausibilityFilter` rejects, as it does those with the gyroscope at 150 rad/s and
+#: those whose position jumps; see ``robots/test_plausibility.py``.
+IMPLAUSIBLE = (
+    *("gyroscope: 20 rad/s", "joint speed: 190 rad/s", "joint speed: 190 rad/s once"),
+    *("joint speed: 190 rad/s at 50 Hz", "joint speed: 25 rad/s", "joint speed: all +-190 rad/s"),
+    *("joint position: 9 rad", "torque: 900 N m", "torque: 900 N m once"),
+    *("orientation: jumps by 0.8 rad", "orientation: jumps by 0.8 rad once"),
+)
+BY_NAME = {kind.name: kind for kind in FAULTS}
+#: The others are played only with ``-m slow``.
+PLAYED = [
+    pytest.param(
+        kind, id=name, marks=[pytest.mark.slow] if name in (*MALFORMED, *IMPLAUSIBLE) else []
+    )
+    for name, kind in BY_NAME.items()
+]
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +60,21 @@ def test_there_are_at_least_60_faults() -> None:
     assert len({kind.name for kind in FAULTS}) == len(FAULTS) >= 60
 
 
-@pytest.mark.parametrize("kind", FAULTS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("name", MALFORMED)
+def test_a_malformed_state_is_rejected(name: str) -> None:
+    fake: Any = SimpleNamespace()
+    BY_NAME[name].begin(cast(FaultRig, SimpleNamespace(fake=fake)))
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    motors = MotorReadings(np.zeros(29))
+    state = LowState(0, np.full(29, 0.1), np.zeros(29), upright, np.zeros(3), 5, motors=motors)
+    message = encode_state(state, np.array([0.0, 0.0, 9.81]))
+    decode_state(message, 0)
+    for altered in fake.alter_state(message):
+        with pytest.raises(MalformedMessage):
+            decode_state(altered, 0)
+
+
+@pytest.mark.parametrize("kind", PLAYED)
 def test_the_reaction_is_the_required_one(rig: FaultRig, kind: FaultKind) -> None:
     for _ in range(_ATTEMPTS):
         row = run_fault(rig, kind)

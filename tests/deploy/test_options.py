@@ -12,7 +12,7 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
 from egovcp.policy_options import PlannerOptions
 from egovcp.sim.config import evaluation_config
-from egovcp.spec import TASKS
+from egovcp.sim.tasks import task_names
 from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import (
     check_choice,
@@ -83,6 +83,8 @@ def test_scenario_seeds_of_collection_evaluation_and_search_are_disjoint() -> No
 
 
 def test_played_episodes_all_have_an_event() -> None:
-    assert {evaluation_config().episode(t).empty_probability for t in TASKS} == {0.0}
+    assert {
+        evaluation_config().episode(t).empty_probability for t in task_names(training=True)
+    } == {0.0}
     given = parse_config(EvalConfig, ["--env.controller=stance"], "egovcp-eval").env
     assert given == replace(evaluation_config(), controller="stance")

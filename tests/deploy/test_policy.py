@@ -12,7 +12,7 @@ import torch
 from egovcp.artifact import load_artifact
 from egovcp.plan.config import BackendName
 from egovcp.spec import ACTION_BOX
-from egovcp_deploy.policy import backend_of, value_maps
+from egovcp_deploy.pilot.planner import backend_of, value_maps
 from tests.support.worlds import PointWorld
 
 

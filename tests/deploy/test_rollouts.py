@@ -13,7 +13,7 @@ from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.pilot.planner import LOGGED_CANDIDATES, InlinePlanner, PlannerRunner
-from egovcp_deploy.robots import ActionResult, RobotObservation
+from egovcp_deploy.robots.base import ActionResult, RobotObservation
 from egovcp_deploy.rollouts import LockstepRunner
 from tests.support.sinks import MemorySink
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.safety import HOLD_RATE, PATIENCE_TICKS, PlanBuffer, SafetyFilter
+from egovcp_deploy.pilot.pilot import HOLD_RATE, PATIENCE_TICKS, PlanBuffer, SafetyFilter
 
 SPECIALS = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, 1.0, -1.0, 1.5])
 

@@ -11,7 +11,7 @@ import pytest
 from egovcp.artifact import save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.plan import PlannerConfig
-from egovcp.robot.stance import StanceController
+from egovcp.robot.controllers import WALK, make_controller
 from egovcp.testing import random_episode, toy_model
 from egovcp_collect.config import CollectConfig
 from egovcp_deploy.mcap.cli import main as egovcp_mcap
@@ -24,16 +24,14 @@ DATASETS = {
     "data/ball": "ball",
     "data/wall": "wall",
     "data/arch": "arch",
-    "data/ball-stance": "ball",
-    "data/wall-stance": "wall",
-    "data/arch-stance": "arch",
+    "data/contact": "ball",
     "data/both": "ball",
     "data/rollouts": "ball",
     "outputs/cards/ball": "ball",
 }
 #: Runs of egovcp-train.
 RUNS = (
-    *("runs/ball-stance", "runs/wall-stance", "runs/arch-stance"),
+    "runs/contact",
     *("runs/ball", "runs/wall", "runs/arch", "runs/all", "runs/lerobot"),
     *("outputs/quickstart/policy", "outputs/experiments/work/train-wall-default-s0"),
 )
@@ -44,7 +42,7 @@ _PLANNER = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.02
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder; tests must not change it."""
     folder = tmp_path_factory.mktemp("documented")
-    controller = StanceController().id
+    controller = make_controller(WALK).id
     for seed, (name, task) in enumerate(DATASETS.items()):
         provenance = Provenance(
             controller, seed, "egovcp-collect", config=draccus.encode(CollectConfig(task=task))

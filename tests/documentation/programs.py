@@ -14,7 +14,7 @@ from functools import cache
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 from unittest import mock
 
 import egovcp.cli
@@ -76,8 +76,7 @@ def known_flags() -> frozenset[str]:
     found: set[str] = set()
     for point in metadata.entry_points(group="console_scripts"):
         if point.name.startswith("egovcp-"):
-            for subcommand in _subcommands(point.name):
-                found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand, "--help=all")))
+            found |= set(re.findall(r"--[\w.-]+", _help(point.name)))
     found |= {flag.replace("--", "--policy.", 1) for flag in flags_of(EgovcpConfig)}
     found |= {flag.replace("--", "--env.", 1) for flag in flags_of(EgovcpEnvConfig)}
     for script in (ROOT / "benchmarks").glob("*.py"):
@@ -86,23 +85,15 @@ def known_flags() -> frozenset[str]:
         found |= {f"--{name}" for name in re.findall(r"^    (\w+): [^=\n]+ = ", text, re.M)}
     for study in (ROOT / "experiment/egovcp_experiment/studies").glob("[a-z]*.py"):
         module = import_module(f"egovcp_experiment.studies.{study.stem}")
-        found |= set(flags_of(module.CONFIG)) if hasattr(module, "CONFIG") else set()
+        if hasattr(module, "measure"):
+            found |= set(flags_of(get_type_hints(module.measure)["config"]))
     return frozenset(found)
 
 
-def _subcommands(program: str) -> list[list[str]]:
-    if program == "egovcp-experiment":
-        return [["ablations"]]  # all have the same options
-    text = _help(program, "--help")
-    names = re.findall(r"^  ([a-z-]+)  ?", text, re.M) if "SUBCOMMAND" in text else []
-    return [[name] for name in names] or [[]]
-
-
-@cache
-def _help(program: str, *arguments: str) -> str:
+def _help(program: str) -> str:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        main_of(program)(list(arguments))
+        main_of(program)(["--help=all"])
     return printed.getvalue()
 
 
@@ -185,6 +176,10 @@ def _check_packages(targets: Sequence[str]) -> None:
         project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
         extras[project["name"]] = set(project.get("optional-dependencies", {}))
     for target in targets:
+        if target == "-e" or (ROOT / target / "pyproject.toml").is_file():
+            continue
+        if target.startswith("egovcp-task-"):  # written by `egovcp-task new`
+            continue
         name, _, wanted = target.rstrip("]").partition("[")
         _require(name in extras, f"there is no package {name}")
         missing = {extra for extra in wanted.split(",") if extra} - extras[name]

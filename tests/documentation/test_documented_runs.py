@@ -19,7 +19,7 @@ from .programs import ROOT, main_of
 from .test_documented_commands import COMMANDS, PAGES, complete, is_result
 
 _SHORT = [
-    "--env.controller=stance",
+    "--env.controller=walk",
     *(f"--env.{task}_episode.ticks=12" for task in ("ball", "wall", "arch")),
     *(f"--env.{task}_episode.event_ticks=[2,3]" for task in ("ball", "wall", "arch")),
 ]
@@ -47,9 +47,13 @@ _ELSEWHERE = {
     "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",
     "egovcp-dataset audit": "tests/collect/dataset/test_audit.py",
+    "egovcp-task": "tests/deploy/test_task.py",
+    "--task=bag": "tests/test_examples.py",
+    "data/bag": "tests/test_examples.py",
 }
 #: Repository on the fake Hub -> folder.
 _PUBLISHED = {
+    "me/contact": "data/contact",
     **{f"me/egovcp-{task}": f"data/{task}" for task in ("ball", "wall")},
     **{f"egovcp/{task}": f"data/{task}" for task in ("ball", "wall", "arch")},
 }

@@ -79,21 +79,19 @@ def test_flag_that_only_resembles_a_removed_one_is_unknown(flag: str) -> None:
     assert f"unknown option {flag.partition('=')[0]}" in _error(flag)
 
 
-def test_config_file_is_refused_with_all_its_removed_options(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        ("policy: {units: 64, flight: {enabled: true}}\n", "policy.flight"),
+        ("datasets: [{root: a}, {root: b, return_steps: null}]\n", "datasets[1].return_steps"),
+    ],
+)
+def test_config_file_with_a_removed_option_is_refused(
+    content: str, name: str, tmp_path: Path
+) -> None:
     file = tmp_path / "old.yaml"
-    file.write_text(
-        "value_fit: {steps: 0}\n"
-        "passing: {horizon: 3}\n"
-        "policy: {units: 64, flight: {enabled: true}, loss: {value: 1, motion: 2}}\n"
-        "datasets: [{root: a, return_steps: null}]\n"
-    )
-    tracker, fit = REMOVED_OPTIONS["passing"], REMOVED_OPTIONS["value_fit"]
-    steps = REMOVED_OPTIONS["datasets.return_steps"]
-    assert _error(f"--config_path={file}") == (
-        f"--config_path={file} has options that were removed: value_fit ({fit}); "
-        f"passing, policy.flight, policy.loss.motion ({tracker}); "
-        f"datasets[0].return_steps ({steps})"
-    )
+    file.write_text(content)
+    assert _error(f"--config_path={file}").startswith(f"option --{name} was removed: ")
 
 
 # --- options that are not flags ------------------------------------------------------

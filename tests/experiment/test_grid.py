@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 
@@ -148,7 +148,10 @@ def _any(reference: CellOutput | CellFigure | ExternalPath) -> object:
 
 
 def _config(cell: Cell) -> type[Any]:
-    module, name = CONFIGS.get(cell.command.module, (cell.command.module, "CONFIG"))
+    if cell.command.module not in CONFIGS:
+        measure = importlib.import_module(cell.command.module).measure
+        return get_type_hints(measure)["config"]  # type: ignore[no-any-return]
+    module, name = CONFIGS[cell.command.module]
     found: type[Any] = getattr(importlib.import_module(module), name)
     return found
 

@@ -173,17 +173,16 @@ class _Ray:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (_RayTaskError(EnvironmentFailure("node x has no folder")), "^node x has no folder$"),
-        (_RayError("node died"), "gone: node died"),
+        (_RayTaskError(EnvironmentFailure("node x has no folder")), "node x has no folder"),
+        (_RayError("node died"), "its Ray worker or node is gone: node died"),
     ],
 )
 def test_a_task_that_cannot_run_or_is_lost_fails_its_cell(error: Exception, message: str) -> None:
-    with pytest.raises(EnvironmentFailure, match=message):
-        RayRun(_Ray(error), "task").ended()
+    assert RayRun(_Ray(error), "task").ended() == CellExit(5, error=message)
 
 
 def test_a_queued_task_is_cancelled_at_once() -> None:
     run = RayRun(_Ray(), "task")
     assert run.ended() is None
     run.interrupt()
-    assert run.ended() == CellExit(INTERRUPTED, {})
+    assert run.ended() == CellExit(INTERRUPTED)

@@ -156,7 +156,7 @@ def test_async_environments_work() -> None:
     ("options", "message"),
     [
         ({"task": "bal"}, "did you mean 'ball'"),
-        ({"task": None}, "no task None"),
+        ({"task": None}, "unknown task 'None'"),
         ({"fps": 30}, "25 Hz"),
     ],
 )

@@ -27,4 +27,5 @@ def memory_batch(size: int = 32, length: int = 6, seed: int = 0) -> Batch:
         depth=depth,
         state=torch.zeros_like(batch.state),
         mc_return=side + batch.action[..., 0],
+        privileged=torch.zeros_like(batch.privileged),
     )

@@ -19,7 +19,7 @@ def toy_reactive(controller_id: str, seed: int = 0) -> ReactiveNetwork:
         for name, shape in tensor_shapes(config).items()
     }
     tensors["std"] = torch.ones_like(tensors["std"])
-    return ReactiveNetwork.of(tensors, config, controller_id, {"steps": 0})
+    return ReactiveNetwork(tensors, config, controller_id, {"steps": 0})
 
 
 class CountingModel(WorldModel):

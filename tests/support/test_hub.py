@@ -1,5 +1,6 @@
 """The fake Hub does what Hugging Face's library expects of the real one."""
 
+import http.client
 import signal
 import subprocess
 import sys
@@ -154,6 +155,17 @@ def test_faults_apply_to_the_given_requests(api: HfApi, hub: FakeHub) -> None:
         api.dataset_info(REPO)
     api.dataset_info(REPO)
     assert hub.requests == {"info": 3}
+
+
+def test_a_connection_is_kept_after_an_answer_without_a_body(api: HfApi, hub: FakeHub) -> None:
+    """A client may send its next request before it notices that the server has closed."""
+    hub.fail("metadata", "truncate")
+    connection = http.client.HTTPConnection(hub.endpoint.removeprefix("http://"), timeout=20)
+    for _ in range(2):
+        connection.request("HEAD", f"/datasets/{REPO}/resolve/main/README.md")
+        answer = connection.getresponse()
+        assert (answer.status, answer.read(), answer.will_close) == (200, b"", False)
+    connection.close()
 
 
 def test_the_command_prints_its_endpoint(tmp_path: Path) -> None:

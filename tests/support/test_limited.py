@@ -44,7 +44,8 @@ def test_memory_beyond_the_limit_is_refused() -> None:
 
 def test_memory_that_is_used_is_counted() -> None:
     gc.collect()  # what the child would free of earlier tests is not what it uses
-    result = run_limited(lambda: len(bytearray(b"x") * (256 << 20)) and 0)
+    # The kernel may take back pages of libraries meanwhile: far more than what is asserted.
+    result = run_limited(lambda: len(bytearray(b"x") * (768 << 20)) and 0)
     assert result.exit_code == 0
     assert result.memory_bytes > 100 << 20
 

@@ -14,8 +14,8 @@ from egovcp.plan import PlannerConfig
 
 
 def plain_planner(**changes: Any) -> PlannerConfig:
-    """A planner whose candidates are random walks without action costs: J alone decides."""
-    plain = {"samples": 1024, "elites": 64, "hands_cost": 0.0, "step_cost": 0.0}
+    """A planner whose candidates are random walks without a pose cost."""
+    plain = {"samples": 1024, "elites": 64, "pose_cost": 0.0, "action_rate_cost": 0.0}
     return PlannerConfig(**(plain | {"action_parameterization": "random_walk"} | changes))
 
 
@@ -56,10 +56,10 @@ class PointWorld:
 
 
 class ScriptedWorld:
-    """Q, D and rewards read from a script, whatever the actions: tick k has ``values[k]``,
+    """Q, D and rewards read from a script, whatever the actions: step k has ``values[k]``,
     ``deaths[k]`` and ``rewards[k]``.
 
-    The carry is the tick, so a value or a termination asked for at the wrong time shows.
+    The carry is the step, so a value or a termination asked for at the wrong time shows.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class ScriptedWorld:
         self.min_return = torch.tensor(floor)
 
     def start(self, robots: int = 1) -> Tensor:
-        """Tick 0 for every robot, (E,)."""
+        """Step 0 for every robot, (E,)."""
         return torch.zeros(robots, dtype=torch.long)
 
     def expand_candidates(self, carry: Tensor) -> Tensor:

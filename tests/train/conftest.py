@@ -20,7 +20,10 @@ CONTROLLER = "stance-test"
 
 
 def _episode(number: int, length: int, limit: int) -> Episode:
-    """A near block whose place gives the reward; a fall if ``length`` is less than ``limit``."""
+    """A near block whose place gives the reward and the object's height.
+
+    It ends by a fall if ``length`` is less than ``limit``.
+    """
     rng = np.random.default_rng(number)
     depth = np.full((length, spec.DEPTH_ROWS, spec.DEPTH_COLS), 3000, dtype=np.uint16)
     column = rng.integers(0, 48)
@@ -37,6 +40,7 @@ def _episode(number: int, length: int, limit: int) -> Episode:
         truncated=last & (length == limit),
         task="ball",
         time_limit=limit,
+        object=np.tile(np.array([2, 0, column / 48, 1], np.float32), (length, 1)),
         metadata={"seed": 0, "episode": number},
     )
 

@@ -19,15 +19,17 @@ from egovcp.checks import check_artifact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.entry_point import prepare_process
+from egovcp.errors import UsageError
 from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS as MODELS
 from egovcp.model import Batch
 from egovcp_train import device
 from egovcp_train.checkpoint import load_training_state
-from egovcp_train.config import ABLATIONS, PRESETS, OptimizerConfig, TrainConfig
+from egovcp_train.config import ABLATIONS, PRESETS, TrainConfig
 from egovcp_train.device import choose_bf16
 from egovcp_train.loop import Learner
 from egovcp_train.train import main, option_defaults
+from tests.support.earlier import without_optional_columns
 
 type Arguments = Callable[..., list[str]]
 
@@ -257,7 +259,7 @@ def test_a_loss_that_is_not_a_number_ends_the_run_at_once(
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-@pytest.mark.parametrize("sick", ["mc_return", "state"])
+@pytest.mark.parametrize("sick", ["privileged", "state"])
 def test_a_fault_in_mid_run_stops_within_3_steps_and_keeps_the_last_good_checkpoint(
     tmp_path: Path,
     arguments: Arguments,
@@ -374,7 +376,26 @@ def test_paper_preset_sets_the_options_of_the_paper_outside_the_world_model_too(
     assert config.returns.keep_truncated
     assert config.planner.termination_rule == "paper"
     assert (config.planner.samples, config.planner.elites) == (64, 64)
-    assert config.optimizer == OptimizerConfig(lr=0.01, ema=0.0)
+    assert (config.optimizer.lr, config.optimizer.ema) == (0.01, 0.0)
+    assert config.policy.loss.q_target == "mc"
+
+
+def test_a_cost_of_actions_is_not_charged_by_q_and_by_the_planner() -> None:
+    weights = "--returns.weights={pose: 1.0}"
+    with pytest.raises(UsageError, match=r"returns.weights puts pose into Q.*planner.pose_cost"):
+        _parsed(weights)
+    assert _parsed(weights, "--planner.pose_cost=0").returns.weights == {"pose": 1.0}
+
+
+def test_weights_need_recorded_terms(
+    dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = Path(shutil.copytree(dataset_root, tmp_path / "old"))
+    without_optional_columns(old)
+    flags = [f"--dataset.root={old}", f"--output_dir={tmp_path / 'run'}", "--preset=debug"]
+    assert main([*flags, "--reward.weights={block: 2.0}"]) == 2
+    assert "does not have the reward terms" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -401,3 +422,27 @@ def _parsed(*flags: str) -> TrainConfig:
     return parse_config(
         TrainConfig, ["--output_dir=x", *flags], "egovcp-train", "", option_defaults
     )
+
+
+# --- start from a policy ----------------------------------------------------------------------
+def test_a_run_starts_from_the_weights_and_the_normalisation_of_a_policy(
+    tmp_path: Path, arguments: Arguments
+) -> None:
+    assert main(arguments(tmp_path / "first")) == 0
+    first = _last(tmp_path / "first") / "pretrained_model"
+    options = {"policy__pretrained_path": first, "steps": 1, "seed": 3}
+    assert main(arguments(tmp_path / "second", **options, optimizer__lr=1e-12)) == 0
+    before = load_artifact(str(first)).world_model.state_dict()
+    after = load_artifact(str(_last(tmp_path / "second") / "pretrained_model"))
+    for name, value in after.world_model.state_dict().items():
+        torch.testing.assert_close(value, before[name], msg=name)
+
+
+def test_a_policy_of_other_networks_is_refused(
+    tmp_path: Path, arguments: Arguments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = arguments(tmp_path / "run", policy__pretrained_path="contact")
+    assert main(argv) == 2
+    expected = "--policy.pretrained_path=contact: its networks are not those of --policy"
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -19,13 +19,16 @@ from typing import IO, Any, Final
 
 import torch
 
+from egovcp.artifact import load_artifact
+from egovcp.cli import given_options
 from egovcp.data.files import sync, sync_tree
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.files import UnsafeFileError, open_regular, read_text, removed_on_error, sha256
 from egovcp.flags import read_config
+from egovcp.model import WorldModel
 from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.outputs import require_writable
-from egovcp.removed_options import RemovedOptionError, refuse_removed_options
+from egovcp.removed_options import RemovedOptionError
 from egovcp.values import build
 
 CONFIG_FILE: Final = "train_config.yaml"
@@ -48,7 +51,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
         UsageError: a config file is given as well.
         ArtifactError: the stored options cannot be read.
     """
-    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    given = given_options(argv)
     if "--resume" not in argv and given.get("resume", "").lower() != "true":
         return {}
     if "config_path" in given:
@@ -70,13 +73,12 @@ def saved_options(config_class: type, output: Path) -> dict[str, Any]:
         return {}
     try:
         options = read_config(saved)
-        refuse_removed_options(options, str(saved))
         build(config_class, options, "--")
     except OSError as error:
         raise ArtifactError(f"{saved}: cannot be read: {error.strerror}; {_REMEDY}") from error
     except RemovedOptionError as error:
         raise ArtifactError(
-            f"{error}; a run of an older version cannot be resumed: start a new one"
+            f"{saved}: {error}; a run of an older version cannot be resumed: start a new one"
         ) from error
     except (UsageError, ValueError) as error:
         raise ArtifactError(f"{saved}: {error}; {_REMEDY}") from error
@@ -213,3 +215,24 @@ def _load(file: IO[bytes]) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise UnsafeFileError("not a training state")
     return state
+
+
+def pretrained_weights(model: WorldModel, path: str) -> dict[str, torch.Tensor]:
+    """State of ``model`` with the weights and the normalisation of a saved policy.
+
+    A policy has no decoder of the object's state; that of ``model`` stays.
+
+    Raises:
+        ArtifactError: the policy cannot be loaded.
+        UsageError: its networks are not those of ``model``.
+    """
+    own, found = model.state_dict(), load_artifact(path).world_model.state_dict()
+    missing = {name for name in own.keys() - found.keys() if not name.startswith("object_head.")}
+    differing = missing | (found.keys() - own.keys())
+    differing |= {name for name, x in found.items() if name in own and own[name].shape != x.shape}
+    if differing:
+        raise UsageError(
+            f"--policy.pretrained_path={path}: its networks are not those of --policy "
+            f"({', '.join(sorted(differing)[:3])}); give the options that it was trained with"
+        )
+    return own | found

@@ -21,6 +21,18 @@ from egovcp_train.records import WandbConfig
 
 
 @dataclass(frozen=True)
+class PrivilegedValueConfig:
+    """Fit of the target of Q, see `egovcp_train.privileged_value`."""
+
+    updates: int = bounded(6000, least=1, most=10_000_000)
+    """Updates before the training of the world model."""
+    rows: int = bounded(512, least=1, most=1_000_000)
+    """Rows of an update."""
+    lr: float = bounded(1e-3, above=0)
+    """Learning rate at the start; it decays to 0."""
+
+
+@dataclass(frozen=True)
 class OptimizerConfig:
     """AdamW with linear warm-up and cosine decay to 10 % of the peak learning rate."""
 
@@ -34,6 +46,8 @@ class OptimizerConfig:
     """Largest gradient norm."""
     ema: float = bounded(0.995, least=0, below=1)
     """Decay of the EMA of the weights, which is evaluated and saved; 0: no EMA."""
+    privileged_value: PrivilegedValueConfig = field(default_factory=PrivilegedValueConfig)
+    """Fit of the target of Q under --policy.loss.q_target=privileged."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,9 @@ class LoadingConfig:
 class PolicyConfig(WorldModelConfig):
     """Network sizes, losses and Hub upload."""
 
+    pretrained_path: str = ""
+    """Start from the weights and the normalisation of this policy, `contact`, a folder or a Hub id;
+    its networks must have the same sizes."""
     push_to_hub: bool = False
     """Publish the finished policy and its card as a model on the Hub."""
     repo_id: str = ""
@@ -110,14 +127,14 @@ class TrainConfig:
     cli_options: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "policy": (
             *("hidden", "latent", "units", "channels", "dynamics", "value_loss", "loss"),
-            *("push_to_hub", "repo_id", "private"),
+            *("pretrained_path", "push_to_hub", "repo_id", "private"),
         ),
         "policy.loss": ("q_target", "reward"),
         "planner": (
             *("samples", "horizon", "iterations", "elites", "objective", "optimiser"),
-            *("action_parameterization", "hands_cost", "step_cost"),
+            *("action_parameterization", "pose_cost", "action_rate_cost"),
         ),
-        "returns": ("gamma", "steps", "scale"),
+        "returns": ("gamma", "steps", "weights", "scale"),
         "sampling": ("length", "mirror", "tasks"),
         "loading": ("mode", "shuffle"),
         "loading.shuffle": ("episodes",),
@@ -136,7 +153,7 @@ class TrainConfig:
     losses, returns and planner); debug (tiny networks); or an ablation of the default, such as
     no_multistep."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
-    """World model, losses, and where to publish."""
+    """World model, losses, what to start from, and where to publish."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Planner settings stored in the artifact."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
@@ -185,6 +202,12 @@ class TrainConfig:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         require_compatible(self.policy, self.planner)
         require_affordable(self.policy, self.planner)
+        for term in spec.ACTION_TERMS:
+            if self.returns.weights.get(term) and getattr(self.planner, f"{term}_cost"):
+                raise UsageError(
+                    f"--returns.weights puts {term} into Q, and --planner.{term}_cost charges it "
+                    "again; set one of them to 0"
+                )
         loss = self.policy.loss
         if loss.q_target == "td" and self.returns.scale == "per_task":
             raise UsageError(
@@ -207,7 +230,9 @@ def laptop() -> TrainConfig:
 
 def debug() -> TrainConfig:
     """Networks that train in seconds and learn nothing."""
-    return replace(default(), preset="debug", policy=_policy(MODELS["debug"]))
+    optimizer = OptimizerConfig(privileged_value=PrivilegedValueConfig(updates=20, rows=64))
+    policy = _policy(MODELS["debug"])
+    return replace(default(), preset="debug", policy=policy, optimizer=optimizer)
 
 
 def paper() -> TrainConfig:
@@ -221,7 +246,9 @@ def paper() -> TrainConfig:
         preset="paper",
         policy=_policy(MODELS["paper"]),
         planner=PAPER_PLANNER,
-        returns=ReturnConfig(keep_truncated=True, steps=50),
+        returns=ReturnConfig(
+            keep_truncated=True, steps=50, weights=dict.fromkeys(spec.ACTION_TERMS, 1.0)
+        ),
         sampling=SamplingConfig(mirror=False),
         optimizer=OptimizerConfig(ema=0.0),
     )
@@ -252,6 +279,9 @@ _ABLATED_LOSSES: Final[Mapping[str, Mapping[str, Any]]] = {
     "no_moving": {"motion_weight": 0.0},
     "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
     "no_near": {"proximity_weight": 0.0},
+    "no_object": {"object": 0.0, "multistep_object": 0.0},
+    "monte_carlo": {"q_target": "mc"},
+    "no_sampled_actions": {"sampled_actions": 0},
     "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
     "q_of_posterior_only": {"imagined_steps": 0},
 }

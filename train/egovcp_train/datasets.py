@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -46,7 +47,9 @@ FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
 _RETURNS: Final = ReturnConfig()
 _MIN_STD: Final = 1e-6
 
-type Built = tuple[PrefetchIterator, EpisodeStore, Mapping[str, ReturnScale]]
+type Built = tuple[
+    PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore], Mapping[str, ReturnScale]
+]
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,9 @@ class TrainingData:
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
+    learning: Callable[[], EpisodeStore]
+    """Reads the training episodes; those that are not in memory without images, and of a dataset
+    on the Hub a sample of the files."""
     return_scales: Mapping[str, ReturnScale]
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
@@ -90,6 +96,12 @@ def _prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup) -> Tra
     config.loading.shuffle.check()
     config.returns.check()
     readers = open_readers(config)
+    for reader in readers:
+        if config.returns.weights and spec.REWARD_TERMS_KEY not in reader.features:
+            raise UsageError(
+                f"--returns.weights: {reader.root} was written by an earlier version and does not "
+                "have the reward terms; leave the weights out, or collect again"
+            )
     config = pinned(_resolved(config, readers, group), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
@@ -232,7 +244,7 @@ def _in_memory(
     rows = group.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=group.count * sampling.batch_size)
     stream = PrefetchIterator(InMemorySampler(learning, sampling, mix, rows))
-    return stream, heldout, scales
+    return stream, heldout, lambda: learning, scales
 
 
 def _on_disk(
@@ -273,7 +285,8 @@ def _on_disk(
         returns=config.returns,
         checked=not learning.is_remote,
     )
-    return PrefetchIterator(stream), heldout, {}
+    without_images = partial(EpisodeStore.read, sample, config.returns, images=False)
+    return PrefetchIterator(stream), heldout, without_images, {}
 
 
 def _require_returns(

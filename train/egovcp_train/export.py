@@ -1,4 +1,6 @@
-"""``egovcp-export``: the planner's networks as ONNX, with test vectors.
+"""``egovcp-export``: the planner's networks as ONNX, or the policy with weights in half precision.
+
+``--format=float16`` writes `egovcp_train.half_precision`; ``--format=onnx``:
 
 golden.safetensors   inputs/NAME and outputs/NETWORK/NAME, from the original
 export.json          features, controller, planner, SHA-256 and shapes
@@ -23,7 +25,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import draccus
 import numpy as np
@@ -36,13 +38,15 @@ from egovcp import spec
 from egovcp.artifact import WEIGHTS, Artifact, load_artifact
 from egovcp.cli import run_command
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.files import removed_on_error, sha256, write_bytes
+from egovcp.files import removed_on_error, sha256, write_bytes, write_text
 from egovcp.manifest import MANIFEST
 from egovcp.model import Carry, WorldModel
 from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import prepare_output
+from egovcp_train.half_precision import write_half_precision
+from egovcp_train.publish import CARD, card_text
 
 PROG = "egovcp-export"
 SCHEMA: Final = "egovcp-onnx-1"
@@ -58,12 +62,15 @@ class ExportConfig:
     """Write the networks that the planner calls as ONNX, and verify them with onnxruntime.
 
     golden.safetensors has inputs and the outputs of the original, to verify other runtimes.
+    --format=float16 writes a copy of the artifact in half the size, and its card.
     """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The artifact."""
     output_dir: str = ""
-    """New folder for the networks."""
+    """New folder for the result."""
+    format: Literal["onnx", "float16"] = "onnx"
+    """onnx: networks for other runtimes; float16: an artifact with weights in half precision."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,25 +79,35 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def export(config: ExportConfig) -> None:
-    """Write the networks, verify them, and print their largest errors.
+    """Write the networks, verify them, and print their largest errors; or write the artifact.
 
     Raises:
         UsageError: artifact or folder are missing, or the folder is not empty.
-        ArtifactError: the artifact is damaged, or a network differs from the original.
+        ArtifactError: the artifact is damaged, a network differs from the original, or a weight
+            exceeds the range of float16.
         EnvironmentFailure: onnx or onnxruntime is missing, or the folder cannot be written.
     """
     if not config.policy.path or not config.output_dir:
         raise UsageError(
             "--policy.path and --output_dir are needed: the artifact, and a new folder"
         )
-    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
+    onnx = config.format == "onnx"
+    if onnx:
+        require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
     output = prepare_output(config.output_dir, resume=False, resumable=False)
     artifact = load_artifact(config.policy.path, config.policy.revision)
     with removed_on_error(output.with_name(output.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
-        errors = write_export(artifact, work)
+        if onnx:
+            errors = write_export(artifact, work)
+        else:
+            write_half_precision(artifact, work)
         os.replace(work, output)
+    if not onnx:
+        write_text(output / CARD, card_text(load_artifact(str(output)), ""))
+        echo(f"{output / WEIGHTS}: {(output / WEIGHTS).stat().st_size / 1e6:.1f} MB")
+        return
     for name, error in errors.items():
         echo(f"{output / name}.onnx: at most {error:.1e} from the original")
     echo(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")

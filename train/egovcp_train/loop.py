@@ -16,6 +16,7 @@ from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
 from egovcp.model.parallel import data_parallel
+from egovcp.model.privileged_value import PrivilegedValue
 from egovcp.model.value_losses import TargetNetwork
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
@@ -30,8 +31,8 @@ type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
 
 
 class Learner:
-    """Model, averaged model, optimiser, the random stream of the latent noise, and under
-    ``q_target=td`` the target network of Q.
+    """Model, averaged model, optimiser, the random stream of the steps, and the network that
+    predicts the target of Q: the privileged value, or under ``q_target=td`` the target network.
 
     A step has about a thousand small kernels. On a GPU it is launch-bound, so its gradient is
     captured as a CUDA graph (`egovcp.cuda_graphs`).
@@ -44,12 +45,14 @@ class Learner:
         seed: int,
         group: ProcessGroup = SINGLE,
         bf16: bool = False,
+        privileged_value: PrivilegedValue | None = None,
     ) -> None:
         """All processes of ``group`` start from the same ``model`` and ``seed``."""
         self.model = model
         self.config = config
         self.group = group
         self.bf16 = bf16
+        self.privileged_value = privileged_value
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.target = TargetNetwork(model) if model.config.loss.q_target == "td" else None
         self.optimizer = torch.optim.AdamW(
@@ -74,8 +77,9 @@ class Learner:
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
         """One gradient step at ``progress`` in [0, 1] of the run; returns scalar metrics."""
         self.model.train()
+        lr = self.learning_rate(progress)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate(progress)
+            group["lr"] = lr
         with data_parallel(self.group.share):
             noise = sample_step_noise(self.model, batch, self.generator)
             names, values, gradients = self._gradients(batch, noise)
@@ -93,10 +97,10 @@ class Learner:
         return {**terms, "grad_norm": norm}
 
     def _compute_gradients(self, batch: Batch, noise: StepNoise) -> Gradients:
-        head = self.target.head if self.target else None
+        critic = self.target.head if self.target else self.privileged_value
         in_precision = partial(precision, batch.state.device, self.bf16)
         with torch.enable_grad():
-            loss, terms = world_model_gradients(self.model, batch, noise, head, in_precision)
+            loss, terms = world_model_gradients(self.model, batch, noise, critic, in_precision)
         terms = {**terms, "loss/total": loss}
         gradients = tuple(parameter.grad for parameter in self._parameters)
         return tuple(terms), torch.stack(list(terms.values())), gradients
@@ -138,6 +142,7 @@ class Learner:
         torch._foreach_lerp_(means, values, 1 - decay)
 
     def state_dict(self) -> dict[str, Any]:
+        value = self.privileged_value
         return {
             "step": self.step,
             "model": self.model.state_dict(),
@@ -145,6 +150,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             **({"target": self.target.state_dict()} if self.target else {}),
+            **({"privileged_value": value.state_dict()} if value else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -155,6 +161,9 @@ class Learner:
         self.generator.set_state(state["generator"])
         if self.target:
             self.target.load_state_dict(state["target"])
+        if "privileged_value" in state:
+            self.privileged_value = PrivilegedValue.restore(state["privileged_value"])
+            self.privileged_value.to(self.model.state_mean.device)
 
 
 class Budget:

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artifact import FILES, Artifact, load_artifact
+from egovcp.artifact import FILES, PRETRAINED, Artifact, load_artifact, policy_folder
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.files import write_text
@@ -26,6 +26,7 @@ from egovcp.hub import (
     publish,
 )
 from egovcp.outputs import write_report
+from egovcp.packages import SIMULATOR_MODULES, is_installed
 from egovcp.terminal import echo
 from egovcp_train.config import PolicyConfig
 
@@ -35,11 +36,6 @@ CARD: Final = "README.md"
 ASSETS: Final = "assets"
 CURVES: Final = f"{ASSETS}/training.png"
 _PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "numpy")
-_TASKS: Final = {
-    "ball": "block a thrown ball with hand or wrist before it meets the body",
-    "wall": "brace with the hands on a wall that one is pushed towards",
-    "arch": "walk up to an arch that is too low for an upright robot, and duck under it",
-}
 #: Prefix of a metric's name -> its meaning; the longest prefix applies.
 _METRICS: Final = {
     "value/r2": "share of the variance of the Monte Carlo return that Q explains",
@@ -62,7 +58,8 @@ class FolderConfig:
     """Which policy."""
 
     path: str = ""
-    """Folder of the artifact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run."""
+    """Folder of the artifact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run, or `contact`,
+    which ships with egovcp (a folder of that name: `./contact`)."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ def push(config: PolicyPushConfig) -> None:
         ArtifactError: the artifact is damaged.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    if not Path(config.policy.path).is_dir() or not config.policy.path:
+    if not policy_folder(config.policy.path).is_dir() or not config.policy.path:
         raise UsageError(
             f"--policy.path={config.policy.path!r}: expected the folder of an artifact, such as "
             "runs/ball/checkpoints/last/pretrained_model"
@@ -187,21 +184,24 @@ def card_text(artifact: Artifact, repo_id: str) -> str:
 
     Args:
         artifact: the policy.
-        repo_id: id on the Hub, `user/name`, for the examples; empty: they name the folder.
+        repo_id: id on the Hub, `user/name`, for the examples; empty: they name the folder, or the
+            shipped policy.
     """
     from huggingface_hub import ModelCard
 
     manifest = artifact.manifest
     command = manifest.get("command")
     found_versions = manifest.get("versions") or {"egovcp": manifest["egovcp_version"]}
+    folder = artifact.path.resolve()
+    local = folder.name if folder.parent == PRETRAINED.resolve() else str(artifact.path)
     title = repo_id.partition("/")[2] or "egovcp policy"
     card = ModelCard.from_template(
         _front_matter(manifest, title),
         template_str=(files(__package__) / "model_card.md").read_text(encoding="utf-8"),
         title=title,
-        name=repo_id or str(artifact.path),
+        name=repo_id or local,
         on_hub=bool(repo_id),
-        tasks=[(task, _TASKS.get(task, "")) for task in manifest.get("tasks", [])],
+        tasks=[(task, _about(task)) for task in manifest.get("tasks", [])],
         datasets=[_dataset(d, manifest) for d in manifest.get("datasets", [])],
         controller_id=artifact.controller_id,
         step=manifest.get("step", "an unknown number of"),
@@ -217,6 +217,15 @@ def card_text(artifact: Artifact, repo_id: str) -> str:
         features=manifest["features"],
     )
     return f"{str(card).rstrip()}\n"
+
+
+def _about(task: str) -> str:
+    """What the robot has to do; empty if the task or the simulator is not installed."""
+    if not all(map(is_installed, SIMULATOR_MODULES)):
+        return ""
+    from egovcp.sim.tasks.registry import describe_task
+
+    return describe_task(task)
 
 
 def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:

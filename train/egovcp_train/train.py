@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import draccus
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from egovcp.artifact import save_artifact
-from egovcp.cli import run_command, save_config
+from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
@@ -23,12 +25,14 @@ from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import make_evaluator
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
+from egovcp_train import privileged_value
 from egovcp_train.checkpoint import (
     CONFIG_FILE,
     checkpoint_dir,
     load_training_state,
     new_checkpoint,
     prepare_output,
+    pretrained_weights,
     restoring,
     resumed_options,
     saved_options,
@@ -75,17 +79,8 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     """
     if options := resumed_options(TrainConfig, argv):
         return options
-    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
-    if "preset" in given and "config_path" in given:
-        raise UsageError(
-            f"--preset={given['preset']} and --config_path={given['config_path']} both set "
-            "all options; give one of them, and single options as flags"
-        )
-    name = given.get("preset", "")
-    if name not in PRESETS:
-        return {}
-    defaults: dict[str, Any] = draccus.encode(PRESETS[name]())
-    del defaults["output_dir"]
+    defaults = preset_defaults(PRESETS, argv)
+    defaults.pop("output_dir", None)
     return defaults
 
 
@@ -104,10 +99,20 @@ def train(config: TrainConfig) -> None:
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy.world_model())
+    initial: dict[str, Tensor] = {}
+    if config.policy.pretrained_path and not config.resume:
+        initial = pretrained_weights(model, config.policy.pretrained_path)
     data = prepare(config, model, group)
     config = data.config
+    if initial:
+        model.load_state_dict(initial)
     learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16)
-    spent = _restore(output, learner, data) if config.resume else 0.0
+    if config.resume:
+        spent = _restore(output, learner, data)
+    else:
+        start = time.monotonic()
+        learner.privileged_value = privileged_value.prepare(learner.model, data, group)
+        spent = time.monotonic() - start  # it is part of --max_minutes
     provenance = _provenance(data)
     simulation = None
     if group.is_first:
@@ -275,7 +280,8 @@ class TrainingRun:
             "seconds": self.budget.spent,
         }
         with new_checkpoint(self.output, self.learner.step, state) as folder:
-            save_artifact(folder, model, self.config.planner, provenance)
+            shipped = model.without_object_head()
+            save_artifact(folder, shipped, self.config.planner, provenance)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
         summary = {"loss": f"{float(terms['loss/total']):.3f}"}

@@ -80,10 +80,8 @@ def resimulate(
     """Simulate recorded episodes again.
 
     Args:
-        reader: the dataset.
-        episodes: their indices.
-        on_step: see `Simulation`; the scenario of a row identifies its episode.
-        render_depth: see `Simulation`.
+        episodes: indices in the dataset.
+        on_step: see `Simulation`, as ``render_depth``; a row's scenario identifies its episode.
 
     Yields:
         Index and content of each episode, in the order in which they end.

@@ -16,6 +16,7 @@ from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
 from egovcp.files import write_text
 from egovcp.outputs import output_file
+from egovcp.sim.tasks.registry import describe_task
 from egovcp.terminal import echo
 from egovcp_collect.dataset import card_tables
 from egovcp_collect.dataset.coverage import assess, summary
@@ -25,11 +26,6 @@ from egovcp_collect.dataset.statistics import DatasetStatistics, compute_statist
 CARD: Final = "README.md"
 ASSETS: Final = "assets"
 _PLOTS: Final = ("events", "returns", "actions", "depth")
-_TASKS: Final = {
-    "ball": "block a thrown ball with hand or wrist before it meets the body",
-    "wall": "brace with the hands on a wall when pushed towards it",
-    "arch": "walk up to an arch that is too low for an upright robot, and duck under it",
-}
 _BOUNDARY: Final = {"reflect": "reflected at the faces of the box", "clip": "clipped to the box"}
 
 
@@ -85,7 +81,7 @@ def _render(
         _front_matter(name, reader.num_frames),
         template_str=(files(__package__) / "card_template.md").read_text(encoding="utf-8"),
         title=f"{name.partition('/')[2]}: Unitree G1, {', '.join(tasks)}",
-        tasks=[{"name": task, "about": _TASKS[task]} for task in tasks],
+        tasks=[{"name": task, "about": describe_task(task)} for task in tasks],
         episodes=len(reader),
         steps=reader.num_frames,
         hours=f"{reader.num_frames / reader.fps / 3600:.2f}",
@@ -100,10 +96,6 @@ def _render(
         step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
         ranges=ranges,
         constants=constants,
-        features=card_tables.feature_table(),
-        state=card_tables.state_table(),
-        state_dim=spec.STATE_DIM,
-        action=card_tables.action_table(),
         coverage=card_tables.coverage_table(statistics.tasks),
         events=card_tables.event_table(statistics.tasks),
         plots=plots,

@@ -24,8 +24,11 @@ from egovcp.terminal import echo, one_line
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Read every file and every frame of a dataset, and print file, episode and frame of each
-    problem. Exits with code 3 if there is one."""
+    """Read every file and every frame of a LeRobot v3 dataset, and print file, episode and frame of
+    each problem. Exits with code 3 if there is one.
+
+    Datasets of egovcp must also keep its own contract. Of others, whatever their features, it
+    prints in one line each what it cannot check."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, which is checked without network access, or an id of the Hub."""
@@ -33,7 +36,7 @@ class CheckConfig:
     """Stop after this many problems."""
     json: str = output_file()
     """File for the result: {"ok", "episodes", "frames", "problems": [{"file", "episode", "frame",
-    "problem"}]}; empty: none."""
+    "problem"}], "not_checked": [...]}; empty: none."""
 
 
 def run_check(config: CheckConfig) -> None:
@@ -42,12 +45,21 @@ def run_check(config: CheckConfig) -> None:
     if not (config.dataset.root and root.is_dir()):  # `locate` would stop at the first problem
         root = locate(config.dataset).root
     with progress_bar() as progress:
-        problems = list(islice(dataset_problems(root, progress), config.max_problems))
+        notes: list[str] = []
+        problems = list(islice(dataset_problems(root, progress, notes), config.max_problems))
     episodes, frames = _size(root)
-    result = {"ok": not problems, "episodes": episodes, "frames": frames}
-    write_report(config.json, {**result, "problems": [problem_as_json(p, root) for p in problems]})
+    result = {
+        "ok": not problems,
+        "episodes": episodes,
+        "frames": frames,
+        "problems": [problem_as_json(p, root) for p in problems],
+        "not_checked": notes,
+    }
+    write_report(config.json, result)
     for problem in problems:
         echo(one_line(problem))
+    for note in notes:
+        echo(one_line(f"not checked: {note}"))
     if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
         folders = shlex.join([str(root / "data"), str(root / "meta")])
         echo(
@@ -78,7 +90,7 @@ def progress_bar(title: str = "") -> Iterator[Callable[[int, int], None]]:
 def _size(root: Path) -> tuple[int, int]:
     """Episodes and frames according to ``info.json``; 0 where they are unknown."""
     try:
-        info = metadata.load_info(root)
+        info = metadata.load_v3_info(root)
     except DataError:
         return 0, 0
     counts = (info.get(key) for key in ("total_episodes", "total_frames"))

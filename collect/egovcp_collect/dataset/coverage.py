@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
+from egovcp.data.lerobot import LeRobotReader, is_own
+from egovcp.data.source import locate
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
+from egovcp_collect.dataset.card_tables import coverage_column
+from egovcp_collect.dataset.feature_coverage import report_features
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.statistics import (
     DatasetStatistics,
-    Distribution,
     TaskStatistics,
     compute_statistics,
 )
@@ -45,6 +48,8 @@ class CoverageConfig:
     """Report event rates, returns, actions, depth and scenes of a dataset, and assess them.
 
     Reads all columns but depth, of which it samples. Failed checks do not change the exit code.
+    Of a LeRobot v3 dataset that egovcp did not collect, it reports the range of every number, and
+    those that are constant.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -71,6 +76,10 @@ def run_coverage(config: CoverageConfig) -> None:
     config.returns.check()
     if config.output_dir:
         require_matplotlib()
+    root = locate(config.dataset).root
+    if not is_own(root):
+        write_report(config.json, report_features(LeRobotReader.open(root)))
+        return
     reader = DatasetReader.open(config.dataset)
     statistics = compute_statistics(reader, config.returns)
     checks = assess(statistics)
@@ -94,41 +103,18 @@ def run_coverage(config: CoverageConfig) -> None:
 
 
 def _describe(task: TaskStatistics) -> Iterator[str]:
-    yield f"{task.task}: {task.episodes} episodes, {task.steps} steps ({task.step_share:.0%})"
-    yield f"  length      {_format(task.length, 0)} ticks"
-    yield f"  outcome     success {task.success_share:.1%}, fall {task.fall_share:.1%} of episodes"
-    yield "  events      ticks per 1000 steps, share of episodes"
+    yield f"{task.task}:"
+    for name, text in coverage_column(task).items():
+        yield f"  {name:54}{text}"
+    yield "  events                    ticks per 1000 steps, share of episodes"
     for name, rate in task.events.items():
-        yield f"    {name:14}{rate.per_1000_steps:8.2f}   {rate.episode_share:8.1%}"
-    yield f"  reward      {_format(task.reward)}"
-    r = task.returns
-    yield f"  return      {_format(r.spread)}; gamma {r.gamma:g}, {r.steps} ticks"
-    yield (
-        f"              {r.valid_share:.0%} of the rows have one; with a reward event ahead "
-        f"{r.positive_share:.1%}, with a cost event ahead {r.negative_share:.1%}"
-    )
-    yield "  actions     uniformity (0 to 1), range of targets in m"
+        yield f"    {name:24}{rate.per_1000_steps:8.2f}   {rate.episode_share:8.1%}"
+    yield "  actions                   uniformity (0 to 1), range of targets in m"
     for name, (low, high) in task.action.workspace_m.items():
-        yield f"    {name:14}{task.action.uniformity[name]:8.2f}     {low:6.2f} to {high:5.2f}"
-    occupied = ", ".join(f"{hand} {share:.0%}" for hand, share in task.action.occupied.items())
-    yield f"  hand cells  {occupied} occupied"
-    d = task.depth
-    yield (
-        f"  depth       {d.valid_share:.0%} of the pixels valid, {d.near_share:.1%} nearer than "
-        f"1 m, median {d.median_m:.2f} m, {d.empty_share:.1%} of the frames empty "
-        f"({d.episodes} episodes)"
-    )
-    yield "  scenes      drawn parameters"
+        yield f"    {name:24}{task.action.uniformity[name]:8.2f}     {low:6.2f} to {high:5.2f}"
+    yield "  scenes                    drawn parameters"
     for name, drawn in task.scene.items():
         yield f"    {name:26}{drawn.low:9.3g} to {drawn.high:.3g}, mean {drawn.mean:.3g}"
-
-
-def _format(values: Distribution | None, digits: int = 3) -> str:
-    if values is None:
-        return "none"
-    parts = [f"{name} {getattr(values, name):.{digits}f}" for name in ("low", "median", "high")]
-    quantiles = f"5 % {values.q05:.{digits}f}, 95 % {values.q95:.{digits}f}"
-    return f"{', '.join(parts)}, {quantiles}, mean {values.mean:.{digits}f}, std {values.std:.3f}"
 
 
 def assess(statistics: DatasetStatistics, limits: CoverageLimits = _LIMITS) -> list[CoverageCheck]:

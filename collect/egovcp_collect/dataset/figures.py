@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +24,7 @@ from egovcp_collect.dataset.statistics import (
 from egovcp_collect.dataset.task_data import SHOWN_FRAMES, DepthFrames, TaskRows
 
 _GOOD, _BAD, _NEUTRAL = "#1b7837", "#c0392b", "#8a8f98"
-_COLOURS: Final = {"ball": "#d95f02", "wall": "#7570b3", "arch": "#1b9e77"}
+_COLOURS: Final = ("#d95f02", "#7570b3", "#1b9e77", "#e7298a", "#66a61e", "#e6ab02")  # per task
 _AROUND_EVENT: Final = (-20, 160)  # ticks
 _GAP_PIXELS: Final = 2  # between depth images
 _MAX_DENSITY_ROWS: Final = 200_000
@@ -79,7 +80,7 @@ def _events(tasks: Sequence[TaskStatistics]) -> Any:
     bars = max(len(task.events) for task in tasks)
     figure = _figure(4.2 * max(len(tasks), 2), 0.9 + 0.32 * bars)
     for axes, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        good, bad = GOOD_TERMS[task.task], (*BAD_TERMS[task.task], "touch.other")
+        good, bad = GOOD_TERMS, (*BAD_TERMS, "touch.other")
         names = list(task.events)
         rates = [task.events[name].per_1000_steps for name in names]
         colours = [_GOOD if n in good else _BAD if n in bad else _NEUTRAL for n in names]
@@ -104,12 +105,12 @@ def _returns(tasks: Sequence[TaskRows], config: ReturnConfig) -> Any:
     """Per task: histograms of the return by the events ahead; the return around the event."""
     figure = _figure(4.8 * max(len(tasks), 2), 6.0)
     columns = figure.subplots(2, len(tasks), squeeze=False).T
-    for (above, below), rows in zip(columns, tasks, strict=True):
+    for (above, below), rows, colour in zip(columns, tasks, cycle(_COLOURS)):
         title = f"{rows.task}: return over {config.steps} ticks"
         above.set_title(title, fontsize=10)
         if rows.mc_valid.any():
             _return_histogram(above, rows, config, title)
-            _return_around_event(below, rows)
+            _return_around_event(below, rows, colour)
     return figure
 
 
@@ -127,7 +128,7 @@ def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig, title: st
     _label(axes, "Monte Carlo return", "rows", title, legend=True)
 
 
-def _return_around_event(axes: Any, rows: TaskRows) -> None:
+def _return_around_event(axes: Any, rows: TaskRows, colour: str) -> None:
     """Mean, median and 5 to 95 % of the return over the time since the event."""
     events = [metadata.get("event_tick") for metadata in rows.metadata]
     starts = rows.start + [10**9 if tick is None else tick for tick in events]
@@ -137,7 +138,6 @@ def _return_around_event(axes: Any, rows: TaskRows) -> None:
     if values:
         low, median, high = np.array([np.quantile(v, (0.05, 0.5, 0.95)) for v in values.values()]).T
         time = np.array([*values]) * PLANNER_DT
-        colour = _COLOURS[rows.task]
         axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0, label="5 to 95 %")
         axes.plot(time, median, color=colour, lw=1, ls="--", label="median")
         means = [v.mean() for v in values.values()]
@@ -153,10 +153,10 @@ def _actions(statistics: DatasetStatistics) -> Any:
     edges = np.linspace(-1.0, 1.0, HISTOGRAM_BINS + 1)
     panels = top.subplots(1, len(ACTION_NAMES), sharey=True)
     for axes, name in zip(panels, ACTION_NAMES, strict=True):
-        for task in statistics.tasks:
+        for task, colour in zip(statistics.tasks, cycle(_COLOURS)):
             counts = np.array(task.action.histogram[name])
             density = counts / counts.sum() * HISTOGRAM_BINS
-            axes.stairs(density, edges, color=_COLOURS[task.task], lw=1.4, label=task.task)
+            axes.stairs(density, edges, color=colour, lw=1.4, label=task.task)
         axes.axhline(1.0, color="0.7", lw=0.8, zorder=0)
         axes.set(xlim=(-1, 1), xticks=[-1, 0, 1])
         _label(axes, title=name.replace("_", " "))

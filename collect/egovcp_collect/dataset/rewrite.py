@@ -6,6 +6,7 @@ import itertools
 import os
 import shlex
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -13,13 +14,15 @@ from typing import Literal
 from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
+from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
 from egovcp.data.destination import require_new, resolve_root
+from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError, UsageError
 from egovcp.outputs import output_file, write_report
-from egovcp.terminal import echo, one_line
+from egovcp.terminal import echo, echo_lines, one_line
 from egovcp_collect.dataset.check import problem_as_json
 from egovcp_collect.dataset.record_index import (
     RecordIndex,
@@ -28,6 +31,7 @@ from egovcp_collect.dataset.record_index import (
     require_one_controller,
 )
 from egovcp_collect.dataset.recovery import RecoveredEpisode, recover_episodes
+from egovcp_collect.dataset.subset import EpisodeScan, SubsetWriter, new_dataset
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,9 @@ class RepairConfig:
     """Write every readable, valid and unaltered episode to a new dataset, and list the dropped
     ones with reasons. The old dataset is not changed.
 
+    Of a LeRobot v3 dataset that egovcp did not collect, tables, totals and statistics are written
+    anew from the rows, and videos are copied as they are.
+
     LeRobot's own tools (delete_episodes, split_dataset, merge_datasets) drop
     meta/collection.json; --records restores it from the datasets that they were given."""
 
@@ -75,7 +82,7 @@ def run_merge(config: MergeConfig) -> None:
         raise UsageError("merge needs two datasets or more: egovcp-dataset merge A B ...")
     datasets = (config.dataset, *(DatasetConfig(root=other) for other in config.others))
     readers = [DatasetReader.open(dataset) for dataset in datasets]
-    output = _new_folder(config.output_dir, [reader.root for reader in readers])
+    output = new_folder(config.output_dir, [reader.root for reader in readers])
     require_one_controller({reader.root: reader.controller_id for reader in readers})
     places, dropped = _distinct_episodes(readers, config.duplicates)
     command = shlex.join(["egovcp-dataset", "merge", *(str(reader.root) for reader in readers)])
@@ -91,7 +98,7 @@ def run_merge(config: MergeConfig) -> None:
     echo(f"{output}: {len(places)} episodes, {frames} frames; {dropped} duplicates dropped")
 
 
-def _new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
+def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
     """The folder ``--output_dir``.
 
     Raises:
@@ -145,10 +152,13 @@ def run_repair(config: RepairConfig) -> None:
     """Write the new dataset and print the dropped episodes."""
     root = local_root(config.dataset)
     require_folder(root)
-    output = _new_folder(config.output_dir, [root])
+    output = new_folder(config.output_dir, [root])
     originals = [
         Path(os.path.expanduser(name)).absolute() for name in config.records.split(",") if name
     ]
+    if not is_own(root) and not originals:
+        _report(config, root, output, *_repair_other(root, output))
+        return
     flags = [f"--records={','.join(map(str, originals))}"] if originals else []
     command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
     index = RecordIndex.build(root, originals, command)
@@ -162,6 +172,12 @@ def run_repair(config: RepairConfig) -> None:
         raise
     kept, frames = writer.num_episodes, writer.num_frames
     writer.finalize() if kept else writer.discard()
+    _report(config, root, output, kept, frames, dropped)
+
+
+def _report(
+    config: RepairConfig, root: Path, output: Path, kept: int, frames: int, dropped: list[DataError]
+) -> None:
     for error in dropped:
         echo(one_line(f"dropped: {error}"))
     problems = [problem_as_json(error, root) for error in dropped]
@@ -169,6 +185,28 @@ def run_repair(config: RepairConfig) -> None:
     if not kept:
         raise DataError(f"no episode of {root} can be kept; {len(dropped)} problem(s), see above")
     echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
+
+
+def _repair_other(root: Path, output: Path) -> tuple[int, int, list[DataError]]:
+    """Write the sound episodes of a dataset that egovcp did not collect; returns the numbers of
+    episodes and frames, and what is left behind."""
+    reader, dropped = LeRobotReader(root), list[DataError]()
+    with suppress(_NothingKept), new_dataset(output) as folder:
+        writer = SubsetWriter(reader, folder)
+        for found in EpisodeScan(reader):
+            if isinstance(found, DataError):
+                dropped.append(found)
+            else:
+                writer.add(found)
+        if not writer.num_episodes:
+            raise _NothingKept
+        writer.finish()
+    echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
+    return writer.num_episodes, writer.num_frames, dropped
+
+
+class _NothingKept(Exception):
+    """No episode is sound."""
 
 
 def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) -> Iterator[Episode]:

@@ -23,14 +23,10 @@ from egovcp_collect.dataset.task_data import (
     sample_episodes,
 )
 
-EVENT_REWARD: Final = 0.025  # a braced tick earns 0.03, a blocked ball or a passed arch 1
-#: Reward terms of the event of each task: of a success, and of a failure.
-GOOD_TERMS: Final = {"ball": ("block",), "wall": ("brace",), "arch": ("pass",)}
-BAD_TERMS: Final = {
-    "ball": ("hit", "fall"),
-    "wall": ("contact", "fall"),
-    "arch": ("head", "contact", "fall"),
-}
+EVENT_REWARD: Final = 0.05  # events count 1, poses at most 0.02
+#: Reward terms of a success, and of a failure.
+GOOD_TERMS: Final = ("block", "pass")
+BAD_TERMS: Final = ("hit", "fall")
 HISTOGRAM_BINS: Final = 40
 """Bins of an action's histogram, over [-1, 1]."""
 GRID_CELLS: Final = 8
@@ -174,7 +170,7 @@ def _task_statistics(
 ) -> TaskStatistics:
     ticks = [_event_ticks(metadata) for metadata in rows.metadata]
     good, bad = (
-        np.array([any(t.get(name) for name in terms[rows.task]) for t in ticks])
+        np.array([any(t.get(name) for name in terms) for t in ticks])
         for terms in (GOOD_TERMS, BAD_TERMS)
     )
     names = dict.fromkeys(name for episode in ticks for name in episode)

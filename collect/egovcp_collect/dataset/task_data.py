@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.data import DatasetReader, Episode, ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.robot.kinematics import palm_positions
+from egovcp.sim.tasks import Task, task_entries
 
 _COLUMNS: Final = (
     spec.ACTION_KEY,
@@ -25,8 +26,6 @@ _SHOWN_EPISODES: Final = 2  # of each task
 SHOWN_FRAMES: Final = 8
 """Depth images shown of an episode."""
 _NEAR_MM: Final = 1000
-#: Duration of the event of a task, planner ticks.
-_EVENT_TICKS: Final = {"ball": 25, "wall": 50, "arch": 175}
 
 
 @dataclass(frozen=True)
@@ -51,15 +50,17 @@ class TaskRows:
 
 
 def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
-    """The rows of each task in the dataset, in the order of `spec.TASKS`; 50 bytes per row.
+    """The rows of each task in the dataset, in the order of their first episodes; 50 bytes per row.
 
     Raises:
         DataError: a file is damaged.
     """
     columns = reader.read_columns(_COLUMNS)
     tasks = np.array([reader.task(i) for i in range(len(reader))])
-    present = [task for task in spec.TASKS if (tasks == task).any()]
-    return [_rows_of(reader, task, tasks == task, columns, returns) for task in present]
+    return [
+        _rows_of(reader, task, tasks == task, columns, returns)
+        for task in dict.fromkeys(tasks.tolist())
+    ]
 
 
 def _rows_of(
@@ -162,6 +163,7 @@ def sample_episodes(reader: DatasetReader, rows: TaskRows) -> TaskSample:
 def _event_frames(episode: Episode, index: int) -> DepthFrames:
     """Up to `SHOWN_FRAMES` images from the event on; from the start if there is none."""
     first = min(episode.metadata.get("event_tick") or 0, len(episode) - 1)
-    last = min(first + _EVENT_TICKS[episode.task], len(episode) - 1)
+    known = {entry.name: entry.task for entry in task_entries()}.get(episode.task)
+    last = min(first + (known or Task).event_ticks, len(episode) - 1)
     tick = np.unique(np.rint(np.linspace(first, last, SHOWN_FRAMES)).astype(np.int64))
     return DepthFrames(index, tick, episode.depth[tick])

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.data.lerobot import LeRobotReader, is_own
+from egovcp.data.source import locate
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
 from egovcp.outputs import output_file, require_writable
@@ -22,7 +24,8 @@ class VizConfig:
     """Show an episode in Rerun: depth, the robot's pose, hand targets, actions, rewards, state.
 
     The pelvis pose is not part of a dataset: the robot is drawn at the origin, at its commanded
-    height, tilted as its IMU measured.
+    height, tilted as its IMU measured. Of a LeRobot v3 dataset that egovcp did not collect, it
+    shows the images and a curve of every number.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -38,18 +41,25 @@ class VizConfig:
 def run_viz(config: VizConfig) -> None:
     """Write the recording."""
     require_packages("egovcp-collect", "the recording", "rerun")
-    reader = DatasetReader.open(config.dataset)
-    if not 0 <= config.episode < len(reader):
-        raise UsageError(
-            f"--episode={config.episode}: {reader.root} has episodes 0 to {len(reader) - 1}"
-        )
-    name = reader.root.name
-    if reader.source.commit:  # the folder of a downloaded dataset is named after its commit
-        name = reader.source.repo_id.partition("/")[2]
+    source = locate(config.dataset)
+    own = DatasetReader.open(config.dataset) if is_own(source.root) else None
+    other = LeRobotReader.open(source.root) if own is None else None
+    count = len(own) if own is not None else len(other.rows) if other is not None else 0
+    if not 0 <= config.episode < count:
+        raise UsageError(f"--episode={config.episode}: {source.root} has episodes 0 to {count - 1}")
+    name = source.root.name
+    if source.commit:  # the folder of a downloaded dataset is named after its commit
+        name = source.repo_id.partition("/")[2]
     output = Path(os.path.expanduser(config.output or f"{name}-episode-{config.episode}.rrd"))
     require_writable(output.parent)
-    write_recording(reader, config.episode, output)
-    echo(f"wrote {output}; {POSE}")
+    if own is not None:
+        write_recording(own, config.episode, output)
+        echo(f"wrote {output}; {POSE}")
+    elif other is not None:
+        from egovcp_collect.dataset.feature_recording import record_features
+
+        shown = record_features(other, other.rows[config.episode], output)
+        echo(f"wrote {output}: {', '.join(shown)}; not shown: the robot, whose model is not known")
     if config.spawn:  # the viewer outlives this command; it accepts local connections only
         command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(output)]
         subprocess.Popen(command, start_new_session=True)
@@ -63,7 +73,7 @@ def write_recording(reader: DatasetReader, index: int, output: Path, meshes: boo
 
     episode = reader.read(index)
     output.parent.mkdir(parents=True, exist_ok=True)
-    sink = RerunSink(output, imagined=(), meshes=meshes, signals=True)
+    sink = RerunSink(output, meshes=meshes, signals=True)
     sink.open(run_info(reader, index, episode))
     with removed_on_error(output):
         for tick in ticks_of(episode):

@@ -31,9 +31,10 @@ Array = NDArray[np.float64]
 
 #: N m s/rad in DAMP: legs and waist let a standing robot sink in about a second.
 DAMPED: Final = np.concatenate([np.full(15, 8.0), np.full(NUM_JOINTS - 15, 2.0)])
-#: Bounds of vx, vy (m/s) and yaw rate (rad/s) in the heading frame, and of their change per s.
-VELOCITY_LOW: Final = (-0.3, -0.2, -0.5)
-VELOCITY_HIGH: Final = (0.6, 0.2, 0.5)
+#: Bounds of vx, vy (m/s) and yaw rate (rad/s) in the heading frame, which the walking controller is
+#: evaluated at (docs/lowlevel.md), and of their change per s.
+VELOCITY_LOW: Final = (-0.3, -0.2, -0.6)
+VELOCITY_HIGH: Final = (0.8, 0.2, 0.6)
 VELOCITY_RAMP: Final = (1.0, 1.0, 2.0)
 _VELOCITY_TIMEOUT_S: Final = 0.5  # an older target counts as zero
 _MIDDLE: Final = (TARGET_LOW + TARGET_HIGH) / 2
@@ -75,15 +76,29 @@ class VelocityCommand:
     def __init__(self) -> None:
         self._target: Array = np.zeros(3)
         self._target_ns: int | None = None
+        self._warned = False
         self._command: Array = np.zeros(3)
         self._last_ns: int | None = None
 
-    def set_target(self, time_ns: int, velocity: NDArray[np.floating] | tuple[float, ...]) -> None:
-        """Request ``velocity`` (3,); one of another shape or not finite is ignored."""
+    def set_target(self, time_ns: int, velocity: NDArray[np.floating] | tuple[float, ...]) -> str:
+        """Request ``velocity`` (3,); one of another shape or not finite is ignored.
+
+        Returns:
+            A warning at the first velocity that is outside the bounds; else empty.
+        """
         target = np.asarray(velocity, np.float64)
-        if target.shape == (3,) and np.isfinite(target).all():
-            self._target = np.clip(target, VELOCITY_LOW, VELOCITY_HIGH)
-            self._target_ns = time_ns
+        if target.shape != (3,) or not np.isfinite(target).all():
+            return ""
+        self._target = np.clip(target, VELOCITY_LOW, VELOCITY_HIGH)
+        self._target_ns = time_ns
+        if self._warned or np.array_equal(self._target, target):
+            return ""
+        self._warned = True
+        asked, sent = (", ".join(f"{v:g}" for v in x) for x in (target, self._target))
+        return (
+            f"warning: velocity ({asked}) is outside the bounds of the controller; ({sent}) is "
+            "commanded, and likewise from now on"
+        )
 
     def at(self, time_ns: int, allowed: bool = True) -> Array:
         """(3,) the velocity to command now; ``allowed``: whether the robot may move."""
@@ -145,7 +160,8 @@ class ControlLoop:
             self.pilot.next_action()
             self._pending = False
         if command.velocity is not None:
-            self._velocity.set_target(now_ns, command.velocity)
+            warning = self._velocity.set_target(now_ns, command.velocity)
+            self.pilot.add_events([warning] if warning else [])
         velocity = self._velocity.at(now_ns, allowed=self.state is State.RUN)
         sent = np.concatenate([velocity, ACTION_BOX.to_metric(self.pilot.sent)])
         state = None if reading is None else proprioception(reading, sent)

@@ -11,8 +11,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from typing import Final
 
 from egovcp.errors import EgovcpError
@@ -24,11 +24,10 @@ from egovcp.workers import stop_on_signal
 from egovcp_deploy.live.control import ControlLoop, damping_command
 from egovcp_deploy.live.hardware import ControlSetup, Hardware, open_hardware
 from egovcp_deploy.live.link import Link, RemotePlanner
-from egovcp_deploy.live.operators import ButtonCommands
+from egovcp_deploy.live.operators import RemoteOperator
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowLevelRobot
-from egovcp_deploy.robots.remote_control import RemoteControl
 
 #: Real-time priorities of threads that receive, and of the loop. The kernel's own threads have 50.
 RECEIVING: Final = 10
@@ -49,7 +48,7 @@ def control_process(setup: ControlSetup) -> None:
         # Before there are threads: one that holds the interpreter's lock must not be preempted.
         raise_priority(RECEIVING)
         try:
-            hardware = open_hardware(setup.hardware)
+            hardware = open_hardware(setup.bridge, setup.camera)
         except EgovcpError as error:
             # The line above may be an unfinished progress bar.
             echo("\n" + one_line(f"egovcp-deploy: error: {error}"), error=True)
@@ -93,7 +92,8 @@ class ControlProcess:
             commands = self._planner.take_commands()
             if any(command.quit for command in commands):
                 return
-            commands += self._remote.commands(self._body)
+            if (reading := self._body.read()) is not None:
+                commands += self._remote.commands(reading.remote)
             self._loop.tick(now, merged(commands))
             self._check_parent()
             rate.wait()
@@ -123,24 +123,6 @@ def merged(commands: Sequence[OperatorCommand]) -> OperatorCommand:
     return OperatorCommand(request, velocity)
 
 
-class RemoteOperator:
-    """The robot's own remote control: its buttons, and its sticks when they are not at rest."""
-
-    def __init__(self) -> None:
-        self._buttons = ButtonCommands()
-
-    def commands(self, body: LowLevelRobot) -> list[OperatorCommand]:
-        """Inputs since the last call."""
-        reading = body.read()
-        remote = None if reading is None else RemoteControl.parse(reading.remote)
-        if remote is None:
-            return []
-        vx, vy, yaw_rate = remote.velocity.tolist()
-        moving = any((vx, vy, yaw_rate))
-        commands = [OperatorCommand(velocity=(vx, vy, yaw_rate))] if moving else []
-        return commands + self._buttons.update(remote.pressed)
-
-
 def damp_motors(body: LowLevelRobot) -> None:
     """Send several damping commands, 5 ms apart."""
     clock = MonotonicClock()
@@ -153,11 +135,8 @@ def damp_motors(body: LowLevelRobot) -> None:
 
 def raise_priority(level: int) -> bool:
     """Give real-time priority ``level`` (1 to 99) to the calling thread and the threads that it
-    starts from now on; returns whether it was granted.
-
-    SCHED_FIFO needs root, CAP_SYS_NICE, or an ``rtprio`` limit in /etc/security/limits.conf. Where
-    it is refused, the nice value is lowered; with autogrouping (the default of most distributions)
-    that only counts among the threads of a session.
+    starts from now on; returns whether it was granted. SCHED_FIFO needs root, CAP_SYS_NICE, or an
+    ``rtprio`` limit in /etc/security/limits.conf. Where it is refused, the nice value is lowered.
     """
     thread = threading.get_native_id()
     try:
@@ -167,15 +146,3 @@ def raise_priority(level: int) -> bool:
             os.setpriority(os.PRIO_PROCESS, thread, _NICE)
         return False
     return True
-
-
-@contextmanager
-def raised_priority(level: int) -> Iterator[None]:
-    """Threads started in this context inherit real-time priority ``level``, if it is granted; the
-    calling thread gets its own priority back."""
-    with ExitStack() as stack:
-        with suppress(AttributeError, OSError):
-            policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(level))
-            stack.callback(os.sched_setscheduler, 0, policy, parameter)
-        yield

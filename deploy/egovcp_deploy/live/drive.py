@@ -22,25 +22,25 @@ from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import ControlSetup, HardwareOptions
+from egovcp_deploy.live.hardware import ControlSetup
 from egovcp_deploy.live.operators import Operator, open_operator
 from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
 from egovcp_deploy.live.processes import running_control, simulated_robot, stop_control
 from egovcp_deploy.options import make_output_dir
-from egovcp_deploy.pilot.planner import PlannerRunner
-from egovcp_deploy.policy import backend_of
-from egovcp_deploy.recording import missing_ticks, provenance, recording, run_info
+from egovcp_deploy.pilot.planner import PlannerRunner, backend_of
+from egovcp_deploy.recording import missing_ticks, percentiles, provenance, recording, run_info
 
 SIMULATED_S: Final = 15.0  # in RUN: release from the gantry, settling, the episode
 
 
 def drive(config: DeployConfig, artifact: Artifact) -> None:
     """One run of a robot, recorded as rollout 0; raises as `deploy`."""
-    hardware = HardwareOptions(config.robot.bridge, config.robot.camera)
-    artifact.require_controller(make_controller(config.robot.controller).id)
+    robot = config.robot
+    setup = ControlSetup(robot.bridge, robot.camera, robot.controller, robot.limits)
+    artifact.require_controller(make_controller(robot.controller).id)
     folder = make_output_dir(config.output_dir)
     stays = config.operator.type != "auto" or not config.operator.duration
-    _run(config, artifact, folder, hardware, stays=stays, stands=True)
+    _run(config, artifact, folder, setup, stays=stays, stands=True)
 
 
 def drive_simulated(config: DeployConfig, artifact: Artifact) -> None:
@@ -52,15 +52,16 @@ def drive_simulated(config: DeployConfig, artifact: Artifact) -> None:
     config = replace(config, robot=robot, operator=operator)
     artifact.require_controller(make_controller(config.robot.controller).id)
     folder = make_output_dir(config.output_dir)
-    with simulated_robot(config, folder / "task.json") as hardware:
-        _run(config, artifact, folder, hardware, stays=False, stands=False)
+    with simulated_robot(config, folder / "task.json") as (bridge, camera):
+        setup = ControlSetup(bridge, camera, robot.controller, robot.limits)
+        _run(config, artifact, folder, setup, stays=False, stands=False)
 
 
 def _run(
     config: DeployConfig,
     artifact: Artifact,
     folder: Path,
-    hardware: HardwareOptions,
+    setup: ControlSetup,
     stays: bool,
     stands: bool,
 ) -> None:
@@ -74,7 +75,6 @@ def _run(
     runner.warm_up()
     controller_id = make_controller(config.robot.controller).id
     info = run_info(config, controller_id, artifact, backend_of(policy))
-    setup = ControlSetup(hardware, config.robot.controller, config.robot.limits)
     try:
         with (
             open_operator(config.operator) as operator,
@@ -156,8 +156,8 @@ def _report(config: DeployConfig, summary: LiveSummary) -> dict[str, Any]:
         "plans": summary.planned,
         "plans_late": summary.late,
         "skipped_observations": summary.skipped,
-        **_percentiles("plan_ms", summary.plan_ms),
-        **_percentiles("latency_ms", summary.latency_ms),
+        **percentiles("plan_ms", summary.plan_ms),
+        **percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
         "missing_ticks": summary.missing_ticks,
         "damped": summary.damped,
@@ -166,17 +166,12 @@ def _report(config: DeployConfig, summary: LiveSummary) -> dict[str, Any]:
     }
 
 
-def _percentiles(name: str, values: list[float]) -> dict[str, float]:
-    p50, p99 = np.percentile(values or [0.0], [50, 99])
-    return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
-
-
 def _print(summary: LiveSummary, info: RunInfo, folder: Path) -> None:
-    latency = _percentiles("ms", summary.latency_ms)
+    latency = percentiles("ms", summary.latency_ms)
     echo(
-        f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
+        f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
         f"computed by {info.backend}"
         + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
-    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"view it with: rerun {folder / 'rollout-0.rrd'}")

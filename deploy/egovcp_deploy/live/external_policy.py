@@ -7,7 +7,6 @@ damps it when necessary, with the same state machine and limits.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
@@ -26,8 +25,7 @@ from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 
 Array = NDArray[np.float64]
 
-_START_S: Final = 60.0  # for the control process to send its first observation
-_STAND_S: Final = 60.0  # for the operator to bring the robot to RUN
+_START_S: Final = 120.0  # for the operator to bring the robot to RUN
 _OBSERVATION_S: Final = 0.5  # longest wait for an observation; one comes every 40 ms
 _END_S: Final = 5.0
 _PLAN_TICKS: Final = 4  # for which an action is repeated if the next one is late
@@ -38,8 +36,7 @@ class ExternalPolicyRobot:
     None: only the remote control does."""
 
     def __init__(self, setup: ControlSetup, operator: Operator | None = None) -> None:
-        self._setup = setup
-        self._operator = operator
+        self._setup, self._operator = setup, operator
         self._stack = ExitStack()
         self._newest: ObservationMessage | None = None
         self._returned = -1
@@ -52,34 +49,30 @@ class ExternalPolicyRobot:
         return self._newest.mode if self._newest else ""
 
     def connect(self) -> None:
-        """Start the control process and wait until the robot is in RUN.
-
-        Raises:
-            EnvironmentFailure: robot or camera do not answer, or the robot was not brought to RUN.
-            SafetyStop: its motors were damped instead.
-        """
+        """Start the control process and wait until the robot is in RUN. Raises `EnvironmentFailure`
+        if robot or camera do not answer, or it was not brought to RUN, `SafetyStop` if it was
+        damped."""
         try:
             self._control = self._stack.enter_context(running_control(self._setup))
             self._control.watchdog.expected = lambda: self._closing
-            self._await(lambda: self._newest is not None, _START_S, "the first observation")
-            self._await(lambda: self.mode == State.RUN, _STAND_S, "RUN")
+            deadline = time.monotonic() + _START_S
+            while self.mode != State.RUN:
+                self._control.check_alive()
+                self._check_damped()
+                if time.monotonic() > deadline:
+                    raise EnvironmentFailure(
+                        f"waited {_START_S:g} s for RUN, the robot is in {self.mode or 'no state'};"
+                        " on its remote control Y stands it up, A arms it, start lets it run"
+                    )
+                if self._receive(0.02):
+                    self.send(np.zeros(ACTION_DIM))
         except BaseException:
             self.close()
             raise
 
-    def _await(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
-        deadline = time.monotonic() + limit_s
-        while not condition():
-            self._control.check_alive()
-            if self.mode == State.DAMP:
-                raise SafetyStop(f"the motors were damped: {'; '.join(self.events)}")
-            if time.monotonic() > deadline:
-                raise EnvironmentFailure(
-                    f"waited {limit_s:g} s for {what}, the robot is in {self.mode or 'no state'}; "
-                    "on its remote control Y stands it up, A arms it, start lets it run"
-                )
-            if self._receive(0.02):
-                self.send(np.zeros(ACTION_DIM))
+    def _check_damped(self) -> None:
+        if self.mode == State.DAMP:
+            raise SafetyStop(f"the motors were damped: {'; '.join(self.events[-3:])}")
 
     def _receive(self, timeout_s: float) -> bool:
         """Exchange messages with the control process; whether there was an observation."""
@@ -95,11 +88,8 @@ class ExternalPolicyRobot:
         return received
 
     def observe(self) -> ObservationMessage:
-        """The newest observation, after waiting for one that was not returned before.
-
-        Raises:
-            EnvironmentFailure: none came in half a second.
-            SafetyStop: the motors are damped.
+        """The newest observation, after waiting for one that was not returned before. Raises
+        `EnvironmentFailure` if none came in half a second, `SafetyStop` if the motors are damped.
         """
         deadline = time.monotonic() + _OBSERVATION_S
         self._receive(0.0)
@@ -107,17 +97,13 @@ class ExternalPolicyRobot:
             if time.monotonic() > deadline:
                 raise EnvironmentFailure("the robot's control process does not answer any more")
             self._receive(0.02)
-        if self.mode == State.DAMP:
-            raise SafetyStop(f"the motors were damped: {'; '.join(self.events[-3:])}")
+        self._check_damped()
         self._returned = self._newest.tick
         return self._newest
 
     def send(self, action: NDArray[np.floating]) -> Array:
-        """Send an action (7,), box units; returns it as rate limited by the robot, (7,).
-
-        Raises:
-            UsageError: it is not seven finite numbers.
-        """
+        """Send an action (7,), box units; returns it as rate limited by the robot, (7,). Raises
+        `UsageError` if it is not seven finite numbers."""
         wanted = np.asarray(action, np.float64)
         if wanted.shape != (ACTION_DIM,) or not np.isfinite(wanted).all():
             raise UsageError(f"an action is {ACTION_DIM} numbers in [-1, 1], found {wanted}")
@@ -133,10 +119,8 @@ class ExternalPolicyRobot:
         self._control.link.send(encode_operator_command(command))
 
     def close(self) -> None:
-        """Hold, ease the hands to neutral, damp, and disconnect; further calls do nothing.
-
-        A robot on its own feet sinks to the ground: hang it up first.
-        """
+        """Hold, ease the hands to neutral, damp, and disconnect; further calls do nothing. A robot
+        on its own feet sinks to the ground: hang it up first."""
         if self._closing:
             return
         self._closing = True

@@ -25,20 +25,11 @@ class CameraOptions:
 
 
 @dataclass(frozen=True)
-class HardwareOptions:
-    """A G1 behind LeRobot's bridge, and its depth camera."""
-
-    bridge: BridgeConfig = field(default_factory=BridgeConfig)
-    """LeRobot's bridge on the robot, or egovcp-fake-g1."""
-    camera: CameraOptions = field(default_factory=CameraOptions)
-    """The depth camera."""
-
-
-@dataclass(frozen=True)
 class ControlSetup:
     """Configuration of the control process; picklable."""
 
-    hardware: HardwareOptions
+    bridge: BridgeConfig
+    camera: CameraOptions
     controller: str  # low-level controller, see `make_controller`
     limits: Limits
     address: str = ""  # of the link to the planner's process; set when the process is started
@@ -71,12 +62,12 @@ class Hardware:
         self.body.close()
 
 
-def open_hardware(options: HardwareOptions) -> Hardware:
+def open_hardware(bridge: BridgeConfig, camera: CameraOptions) -> Hardware:
     """Connect to body and camera; raises `EnvironmentFailure` if one does not answer."""
-    body = BridgeRobot(options.bridge)
+    body = BridgeRobot(bridge)
     body.connect()
     try:
-        return Hardware(body, open_camera(options.camera))
+        return Hardware(body, open_camera(camera))
     except BaseException:
         body.close()
         raise

@@ -24,7 +24,6 @@ _MOTOR_DTYPES: Final = {
     "torque": "<f8",
     "temperature": "<f8",
     "faults": "<i8",
-    "lost": "<i8",
     "enabled": "?",
 }
 _PLAN_PARTS: Final = 2

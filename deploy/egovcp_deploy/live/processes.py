@@ -22,7 +22,7 @@ from egovcp.parent_death import die_with_parent
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.control_process import control_process, damp_motors
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.robots.base import LowLevelRobot
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
@@ -79,7 +79,7 @@ def running_control(setup: ControlSetup) -> Iterator[RunningControl]:
         setup = replace(setup, address=address, parent=os.getpid())
         with (
             closing(Link(address, serve=True)) as link,
-            standby_body(setup.hardware.bridge) as body,
+            standby_body(setup.bridge) as body,
             child_process(control_process, setup, name="egovcp-control") as process,
         ):
             watchdog = DampingWatchdog(process, body)
@@ -146,13 +146,12 @@ class DampingWatchdog:
 
 # --- the simulated robot ---------------------------------------------------------------------
 @contextmanager
-def simulated_robot(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]:
+def simulated_robot(
+    config: DeployConfig, outcomes: Path
+) -> Iterator[tuple[BridgeConfig, CameraOptions]]:
     """The simulator on the wall clock behind the wire of a robot, on free ports of the loopback;
-    ``outcomes`` is the file for the result of the episode.
-
-    Raises:
-        EnvironmentFailure: the simulator is not installed, or does not start.
-    """
+    ``outcomes`` is the file for the result of the episode. Raises `EnvironmentFailure` if the
+    simulator is not installed, or does not start."""
     from egovcp_deploy.robots.fake.bridge import Ports
     from egovcp_deploy.robots.fake.command import FakeG1Config
 
@@ -170,7 +169,7 @@ def simulated_robot(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOp
         command, state, camera = _received_ports(ours)
         eye = ZmqCameraConfig(port=camera, vertical_fov=config.env.camera.vertical_fov)
         bridge = BridgeConfig(state_port=state, command_port=command)
-        yield HardwareOptions(bridge, CameraOptions(server=eye))
+        yield bridge, CameraOptions(server=eye)
 
 
 def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:

@@ -25,17 +25,9 @@ class FromDatasetConfig:
     """The new recording."""
 
 
-CONFIG = FromDatasetConfig
-
-
 def run(config: FromDatasetConfig) -> None:
-    """Write the recording.
-
-    Raises:
-        UsageError: there is no such episode, or no output is named.
-        DataError: the dataset is damaged.
-        EnvironmentFailure: the output exists, or the packages that read datasets are missing.
-    """
+    """Write the recording. Raises `UsageError` for a missing episode or output, `DataError` for a
+    damaged dataset, `EnvironmentFailure` if the output exists or a package is missing."""
     if not config.output:
         raise UsageError(
             "no output given; usage: egovcp-mcap from-dataset ROOT OUT.mcap --episode=N"

@@ -23,16 +23,9 @@ class RecoverConfig:
     """The new recording."""
 
 
-CONFIG = RecoverConfig
-
-
 def run(config: RecoverConfig) -> None:
-    """Copy the ticks and print how many were copied and lost.
-
-    Raises:
-        DataError: not a recording of ours.
-        EnvironmentFailure: the output exists, or the disk is full.
-    """
+    """Copy the ticks and print how many were copied and lost. Raises `DataError` if it is not a
+    recording of ours, `EnvironmentFailure` if the output exists or the disk is full."""
     if not config.file or not config.output:
         raise UsageError("two files are needed; usage: egovcp-mcap recover TORN OUT")
     ticks, reader = recover(Path(config.file), Path(config.output))
@@ -47,11 +40,8 @@ def _state(reader: RecordingReader) -> str:
 
 
 def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:
-    """Copy the readable ticks of ``source``.
-
-    Returns:
-        Their number, and the reader, which describes the losses.
-    """
+    """Copy the readable ticks of ``source``; returns their number, and the reader, which describes
+    the losses."""
     reader = RecordingReader(source)
     copy = McapFile(output)
     copy.open(reader.metadata)

@@ -44,18 +44,10 @@ class ToDatasetConfig:
     begins in the neutral pose)."""
 
 
-CONFIG = ToDatasetConfig
-
-
 def run(config: ToDatasetConfig) -> None:
-    """Convert the recordings and print what was kept.
-
-    Raises:
-        UsageError: no file is given, or the dataset exists.
-        DataError: a file is not a recording of ours, is damaged, has gaps or another controller,
-            or repeats another file.
-        EnvironmentFailure: the packages that write datasets are missing.
-    """
+    """Convert the recordings and print what was kept. Raises `UsageError` without files or for an
+    existing dataset, `DataError` for a file that is damaged, has gaps or another controller, or
+    repeats another, and `EnvironmentFailure` if a package is missing."""
     if not config.files:
         raise UsageError(
             "no recordings given; usage: egovcp-mcap to-dataset FILE... --dataset.root=ROOT"
@@ -81,11 +73,8 @@ def run(config: ToDatasetConfig) -> None:
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:
-    """Collect what the recordings have in common; configuration and versions are the first's.
-
-    Raises:
-        DataError: the low-level controllers differ, or one is not recorded.
-    """
+    """What the recordings have in common; configuration and versions are the first's. Raises
+    `DataError` if the low-level controllers differ, or one is not recorded."""
     from egovcp.data import Provenance
     from egovcp.rollouts import CONTROLLER
 
@@ -111,25 +100,19 @@ def provenance(paths: Sequence[Path]) -> Provenance:
 
 
 def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
-    """Check that each recording is of another run, before anything is written.
-
-    A copy is recognised by its rows. It may end earlier: a torn or damaged recording that was
-    recovered begins with the same rows.
-
-    Raises:
-        DataError: two recordings have the same rows, or one cannot be converted.
-    """
-    seen: dict[bytes, list[tuple[Path, list[bytes]]]] = {}
+    """Raise `DataError` if two recordings have the same rows, before anything is written. A copy
+    may end earlier: a torn recording that was recovered begins with the same rows."""
+    seen: list[tuple[Path, list[bytes]]] = []
     for path in paths:
         rows = _row_digests(read_episode(path, gaps)[0])
-        for other, other_rows in seen.setdefault(rows[0], []):
+        for other, other_rows in seen:
             shared = min(len(rows), len(other_rows))
             if rows[:shared] == other_rows[:shared]:
                 raise DataError(
                     f"{path} repeats {other}: its first {shared} rows are the same; give each "
                     "rollout once, as its longest recording"
                 )
-        seen[rows[0]].append((path, rows))
+        seen.append((path, rows))
 
 
 def _row_digests(episode: Episode) -> list[bytes]:
@@ -140,14 +123,8 @@ def _row_digests(episode: Episode) -> list[bytes]:
 
 
 def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
-    """Convert a recording to an episode.
-
-    Returns:
-        The episode, and a text on what was left out.
-
-    Raises:
-        DataError: not a recording of ours, damaged, with missing ticks or invalid values.
-    """
+    """Convert a recording to an episode; the text says what was left out. Raises `DataError` if it
+    is not ours, damaged, or has missing ticks or invalid values."""
     from egovcp.rollouts import episode_of
 
     reader = RecordingReader(path)

@@ -52,7 +52,6 @@ NO_TORQUE_PERSISTS_S: Final = 0.14
 _MAX_ELAPSED_S: Final = 0.04  # counted for one reading, also after a gap in the readings
 _HYSTERESIS_K: Final = 5.0  # below the warning limit at which the warning is re-enabled
 _REMINDER_S: Final = 10.0  # between two requests to let the robot down
-_MAX_LOST_PER_S: Final = 50.0  # packets per second of one motor, of about 500
 #: N m; a larger command exceeds friction and the noise of the torque estimate. A torque below
 #: `_TORQUE_SHARE` of the command is near zero.
 LARGE_TORQUE: Final = np.maximum(1.0, 0.1 * EFFORT_LIMIT)
@@ -62,7 +61,6 @@ _LET_DOWN: Final = "let the robot down onto its gantry, damp it (L1 + B) and let
 _FIELDS: Final = {
     "temperature": "motor temperatures",
     "faults": "motor status bits",
-    "lost": "packets lost by motors",
     "enabled": "motor modes",
 }
 _INACTIVE: Final = -1.0
@@ -90,10 +88,8 @@ class MotorWatch:
         self._dropped = _Debounce()
         self._was_enabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
         self._torque_seen = False
-        self._torque_commanded_s = 0.0
         self._warned: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
         self._faults: NDArray[np.integer] = np.zeros(NUM_JOINTS, np.int64)
-        self._lost: tuple[int, NDArray[np.integer]] | None = None
         self._overheated = False
         self._reminder = RateLimiter(_REMINDER_S)
         self._last = MotorVerdict()
@@ -102,12 +98,8 @@ class MotorWatch:
     def update(
         self, reading: LowState, command: MotorCommand | None, standing: bool = True
     ) -> MotorVerdict:
-        """Evaluate the newest reading; a repeated reading changes nothing.
-
-        Args:
-            reading: of the robot's sensors.
-            command: the last command sent before it arrived; None: none.
-            standing: whether the robot stands, so that it can be let down.
+        """Evaluate the newest reading; a repeated one changes nothing. ``command`` is the last one
+        sent before it arrived; ``standing``: whether the robot stands, so that it can be let down.
         """
         motors = reading.motors
         if motors is None or reading.time_ns == self._time_ns:
@@ -126,7 +118,6 @@ class MotorWatch:
             if standing and self._reminder.ready(reading.time_ns):
                 self._events.append(hold)
         refusal = damp or hold or self._arming_refusal(motors)
-        self._check_lost_packets(motors, reading.time_ns)
         self._last = MotorVerdict(refusal, hold, damp, tuple(self._events))
         return self._last
 
@@ -169,12 +160,11 @@ class MotorWatch:
         the command before; the torque that both require is taken.
         """
         previous, self._last_command = self._last_command or command, command
-        torque = _commanded_torque(command, reading)
-        previous_torque = _commanded_torque(previous, reading)
+        torque, previous_torque = command.torque(reading), previous.torque(reading)
         smaller = np.minimum(np.abs(torque), np.abs(previous_torque))
         expected_torque = np.where(torque * previous_torque > 0, smaller, 0.0)
         large = expected_torque > LARGE_TORQUE
-        self._check_torque_estimates(motors, bool(large.any()), elapsed)
+        self._torque_seen |= bool(motors.torque.any())  # all zero: the bridge has no estimate
         without_torque = np.abs(motors.torque) < _TORQUE_SHARE * expected_torque
         without_torque &= large & self._torque_seen
         joint = self._without_torque.update(without_torque, elapsed, NO_TORQUE_PERSISTS_S)
@@ -184,19 +174,6 @@ class MotorWatch:
             f"the motor of {JOINT_NAMES[joint]} does not follow its target: torque "
             f"{motors.torque[joint]:.1f} N m, {expected_torque[joint]:.0f} N m commanded"
         )
-
-    def _check_torque_estimates(self, motors: MotorReadings, large: bool, elapsed: float) -> None:
-        """Log once that the check of torques is off: all-zero torque means that the bridge has no
-        estimate, not that all motors failed."""
-        if self._torque_seen:
-            return
-        self._torque_seen = bool(motors.torque.any())
-        before = self._torque_commanded_s
-        self._torque_commanded_s += elapsed * large
-        if not self._torque_seen and before <= 1.0 < self._torque_commanded_s:
-            self._events.append(
-                "no motor reports any torque: the check for motors that do not follow is off"
-            )
 
     def _overload(self, motors: MotorReadings) -> str:
         if motors.faults is None:
@@ -240,25 +217,6 @@ class MotorWatch:
         words = _degrees(motors.temperature[joint])
         return f"the motor of {JOINT_NAMES[joint]} is at {words}; let it cool"
 
-    def _check_lost_packets(self, motors: MotorReadings, time_ns: int) -> None:
-        """Once a second, log the motor that loses most packets, if it loses many."""
-        if motors.lost is None:
-            return
-        if self._lost is None:
-            self._lost = (time_ns, motors.lost)
-        since, before = self._lost
-        seconds = (time_ns - since) / NS_PER_S
-        if seconds < 1.0:
-            return
-        self._lost = (time_ns, motors.lost)
-        rates = (motors.lost - before) / seconds
-        joint = int(np.argmax(rates))
-        if rates[joint] >= _MAX_LOST_PER_S:
-            self._events.append(
-                f"warning: the motor of {JOINT_NAMES[joint]} loses {rates[joint]:.0f} packets per "
-                "second"
-            )
-
 
 class _Debounce:
     """How long a condition has held for each joint."""
@@ -274,13 +232,6 @@ class _Debounce:
         self._seconds = np.where(condition, longer, _INACTIVE)
         joint = int(np.argmax(self._seconds))
         return joint if self._seconds[joint] >= limit - 1e-9 else None
-
-
-def _commanded_torque(command: MotorCommand, reading: LowState) -> Array:
-    """(29,) N m that a command requires, within the limits of the motors."""
-    torque = command.stiffness * (command.position - reading.joint_position)
-    torque -= command.damping * reading.joint_velocity
-    return np.asarray(np.clip(torque, -EFFORT_LIMIT, EFFORT_LIMIT))
 
 
 def _fault(faults: NDArray[np.integer], joint: int, verb: str = "reports") -> str:

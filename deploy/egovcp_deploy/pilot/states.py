@@ -20,18 +20,12 @@ from egovcp.bounds import bounded
 class State(StrEnum):
     """What the robot is doing."""
 
-    INIT = "init"
-    """Motors damped until the first readings arrive."""
-    STAND = "stand"
-    """The gains ramp in and the controller moves the robot to its stance."""
-    ARMED = "armed"
-    """Stands in the neutral pose; plans are computed but not executed."""
-    RUN = "run"
-    """Executes the planner's actions."""
-    HOLD = "hold"
-    """Stands; the hands ease to neutral, the velocity to zero."""
-    DAMP = "damp"
-    """Motors damped until the program is started again."""
+    INIT = "init"  # motors damped until the first readings arrive
+    STAND = "stand"  # the gains ramp in and the controller moves the robot to its stance
+    ARMED = "armed"  # stands in the neutral pose; plans are computed but not executed
+    RUN = "run"  # executes the planner's actions
+    HOLD = "hold"  # stands; the hands ease to neutral, the velocity to zero
+    DAMP = "damp"  # motors damped until the program is started again
 
 
 class OperatorRequest(StrEnum):

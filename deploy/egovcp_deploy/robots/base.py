@@ -1,8 +1,8 @@
 """Interfaces of robots.
 
-`LockstepRobot` takes planner actions and advances time itself: the simulator and replayed runs.
-`LowLevelRobot` and `DepthCamera` are the motors, IMU and camera of a robot on the wall clock, whose
-low-level controller runs in our process.
+`SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `LowLevelRobot` and
+`DepthCamera` are the motors, IMU and camera of a robot on the wall clock, whose low-level
+controller runs in our process.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import BasePose, CameraView, MotorReadings, SceneObject
+from egovcp.log.tick import BasePose, MotorReadings, SceneObject
+from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 Array = NDArray[np.float64]
@@ -24,10 +25,8 @@ Array = NDArray[np.float64]
 class RobotObservation:
     """One observation o_t. A simulator adds the true poses, for logs only."""
 
-    depth: NDArray[np.uint16]
-    """(48, 64) planar depth, mm, 0 invalid."""
-    state: NDArray[np.float32]
-    """(74,) proprioception in the layout of `spec.STATE_SLICES`."""
+    depth: NDArray[np.uint16]  # (48, 64) planar depth, mm, 0 invalid
+    state: NDArray[np.float32]  # (74,) proprioception in the layout of `spec.STATE_SLICES`
     base: BasePose | None = None
     scene: tuple[SceneObject, ...] = ()
 
@@ -36,97 +35,56 @@ class RobotObservation:
 class ActionResult:
     """Result of one action. A recording of a real robot contains only what was sent."""
 
-    sent: Array
-    """(7,) the action that took effect, box units."""
+    sent: Array  # (7,) the action that took effect, box units
     reward: float = 0.0
     reward_terms: Mapping[str, float] = field(default_factory=dict)
     terminated: bool = False
     truncated: bool = False
     success: bool = False
+    parts: Mapping[str, bool] = field(
+        default_factory=dict
+    )  # ``success`` of each part of a sequence
     events: tuple[str, ...] = ()
-
-
-class LockstepRobot(Protocol):
-    """A robot with a running low-level controller; `act` advances it by one tick of 40 ms."""
-
-    @property
-    def controller_id(self) -> str:
-        """Identity of the low-level controller; it must match that of the policy's data."""
-        ...
-
-    @property
-    def camera(self) -> CameraView:
-        """Mount and field of view of the head camera in the current episode."""
-        ...
-
-    def start(self, episode: int) -> None:
-        """Begin rollout number ``episode`` in the neutral pose."""
-        ...
-
-    def observe(self) -> RobotObservation:
-        """Return the newest observation."""
-        ...
-
-    def act(self, action: Array) -> ActionResult:
-        """Apply an action (7,) that has passed the safety filter, and advance one tick."""
-        ...
-
-    def damp(self) -> None:
-        """Damp the motors until the next `start`; later actions have no effect."""
-        ...
-
-    def close(self) -> None:
-        """Release all resources; may be called more than once."""
-        ...
 
 
 @dataclass(frozen=True)
 class LowState:
     """One reading of joints, IMU and remote control (Unitree's ``rt/lowstate``)."""
 
-    time_ns: int
-    """Time of arrival on this machine's monotonic clock."""
-    joint_position: Array
-    """(29,) rad, ``spec.JOINT_NAMES`` order."""
-    joint_velocity: Array
-    """(29,) rad/s."""
-    quaternion_w: Array
-    """(4,) orientation of the pelvis, (w, x, y, z)."""
-    angular_velocity: Array
-    """(3,) rad/s, pelvis frame."""
-    mode: int = 0
-    """``mode_machine``; every command must repeat it."""
+    time_ns: int  # time of arrival on this machine's monotonic clock
+    joint_position: Array  # (29,) rad, ``spec.JOINT_NAMES`` order
+    joint_velocity: Array  # (29,) rad/s
+    quaternion_w: Array  # (4,) orientation of the pelvis, (w, x, y, z)
+    angular_velocity: Array  # (3,) rad/s, pelvis frame
+    mode: int = 0  # ``mode_machine``; every command must repeat it
     remote: bytes = b""
     """Message of the operator's remote control (`remote_control`); empty if there is none."""
     motors: MotorReadings | None = None
     """Torque, temperature and status of the motors; None if the robot does not report them."""
-    command_sources: int | None = None
-    """Number of programs that sent commands in the last 0.5 s; None if unknown. An extension that
-    LeRobot's bridge does not have."""
 
 
 @dataclass(frozen=True)
 class MotorCommand:
     """Joint targets: each motor applies stiffness * (position - q) - damping * dq."""
 
-    position: Array
-    """(29,) rad, ``spec.JOINT_NAMES`` order."""
-    stiffness: Array
-    """(29,) N m/rad; all zero: damping only."""
-    damping: Array
-    """(29,) N m s/rad."""
-    mode: int = 0
-    """`LowState.mode` of the newest reading."""
+    position: Array  # (29,) rad, ``spec.JOINT_NAMES`` order
+    stiffness: Array  # (29,) N m/rad; all zero: damping only
+    damping: Array  # (29,) N m s/rad
+    mode: int = 0  # `LowState.mode` of the newest reading
+
+    def torque(self, reading: LowState) -> Array:
+        """(29,) N m that the command requires at ``reading``, within the limits of the motors."""
+        torque = self.stiffness * (self.position - reading.joint_position)
+        torque -= self.damping * reading.joint_velocity
+        return np.clip(torque, -EFFORT_LIMIT, EFFORT_LIMIT)
 
 
 @dataclass(frozen=True)
 class DepthImage:
     """One depth image."""
 
-    time_ns: int
-    """Time of arrival on this machine's monotonic clock."""
-    depth: NDArray[np.uint16]
-    """(48, 64) planar depth, mm, 0 invalid."""
+    time_ns: int  # time of arrival on this machine's monotonic clock
+    depth: NDArray[np.uint16]  # (48, 64) planar depth, mm, 0 invalid
     captured_ns: int | None = None
     """Time at which the camera driver received it, on the same clock and without network delay;
     None if unknown."""
@@ -161,12 +119,8 @@ class DepthCamera(Protocol):
 
 
 def proprioception(state: LowState, command: NDArray[np.floating]) -> Array:
-    """Convert a reading to proprioception, (74,) in the layout of `spec.STATE_SLICES`.
-
-    Args:
-        state: the reading.
-        command: (10,) the last one sent: velocity 3, hands 6 (m), height (m).
-    """
+    """Proprioception (74,) in the layout of `spec.STATE_SLICES`, of a reading and the last
+    ``command`` sent (10,): velocity 3, hands 6 (m), height (m)."""
     out = np.empty(STATE_DIM)
     out[STATE_SLICES["angular_velocity"]] = state.angular_velocity
     out[STATE_SLICES["projected_gravity"]] = projected_gravity(state.quaternion_w)

@@ -6,17 +6,19 @@ Commands are sent at once or dropped: none is queued until a robot returns.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import zmq
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
-from egovcp_deploy.robots.base import LowState, MotorCommand
-from egovcp_deploy.robots.command_conflict import CommandConflictDetector
-from egovcp_deploy.robots.g1_variants import variant_refusal, variant_warning
+from egovcp.robot.g1 import EFFORT_LIMIT
+from egovcp.spec import JOINT_NAMES, NUM_JOINTS
+from egovcp_deploy.robots.base import Array, LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
 from egovcp_deploy.robots.subscriber import (
     ArrivalMonitor,
@@ -33,11 +35,53 @@ from egovcp_deploy.robots.wire import (
     encode_command,
 )
 
+LISTEN_S: Final = 0.5  # readings that are needed for a result
+GAP_S: Final = 0.2  # a silence after which the statistics start again
+_TIME_CONSTANT_S: Final = 0.3  # of each joint's average
+_MAX_SHARE: Final = 0.35  # of deviating readings; two equal publishers cause about one half
+_TOLERANCE: Final = np.maximum(1.0, 0.05 * EFFORT_LIMIT)  # N m
+_RELATIVE_TOLERANCE: Final = 0.5  # gains and torque estimates are rough
+_NO_COMMAND: Final = MotorCommand(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS))
+
 MODE_CHANGE_S: Final = 0.1  # shorter changes of the mode machine are ignored
+#: Hardware by mode machine, from robots/g1_description/README.md of unitreerobotics/unitree_ros.
+_JOINTS: Final = {1: 23, 4: 23, 9: 14, 10: 23} | dict.fromkeys((2, 3, 5, 6, *range(11, 17)), 29)
+_WAIST_LOCKED: Final = (3, 6, 12, 14, 16)  # by its fastener and by the switch in Unitree's app
+_HIP_GEAR_22: Final = (10, 11, 12, 15, 16)  # 22.5; the gains in `egovcp.robot.g1` are for 14.3
 _START: Final = (
     "start it on the robot: python -m lerobot.robots.unitree_g1.run_g1_server; or without a "
     "robot, here: egovcp-fake-g1"
 )
+
+
+def mode_refusal(mode: int, confirmed: bool) -> str:
+    """Why our controllers, which command all 29 joints, must not drive a robot with this mode
+    machine; empty: they may. ``confirmed``: the user has named it and accepts a locked waist."""
+    joints = _JOINTS.get(mode, 29)
+    if joints != 29:
+        return (
+            f"mode machine {mode} is a G1 with {joints} joints; the controller commands 29: use a "
+            "robot that has them"
+        )
+    if mode in _WAIST_LOCKED and not confirmed:
+        return (
+            f"mode machine {mode} is a G1 whose waist is locked, and the controller balances with "
+            "waist roll and pitch: remove the fastener and switch the waist lock off in Unitree's "
+            f"app, or accept it with --robot.bridge.mode={mode}"
+        )
+    return ""
+
+
+def mode_warning(mode: int) -> str:
+    """How a robot with this mode machine differs from what the controllers are made for; empty: it
+    does not."""
+    if mode not in _JOINTS:
+        return f"mode machine {mode} is not known: 29 joints and a free waist are not checked"
+    if mode in _WAIST_LOCKED:
+        return f"mode machine {mode}: the waist is locked, and balance is untested without it"
+    if mode in _HIP_GEAR_22:
+        return f"mode machine {mode}: the hip pitch gear is 22.5, the gains are for 14.3; untested"
+    return ""
 
 
 @dataclass(frozen=True)
@@ -53,9 +97,6 @@ class BridgeConfig:
     mode: int | None = None
     """Required mode machine, which identifies the robot's variant; null: any with 29 joints and a
     free waist. Naming a mode with a locked waist accepts it."""
-    consistency: bool = True
-    """Reject readings whose positions and speeds contradict each other. Bounds are always
-    checked."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -66,19 +107,69 @@ class BridgeCounters:
     """Messages received and sent."""
 
     readings: int = 0
-    implausible: int = 0
-    """Rejected readings that no G1 can produce (`plausibility`)."""
+    implausible: int = 0  # rejected readings that no G1 can produce (`plausibility`)
     repeated: int = 0
     """Readings identical to the last one: sensor noise never repeats, so the driver is stuck."""
-    malformed: int = 0
-    """Messages that are not states."""
+    malformed: int = 0  # messages that are not states
     sent: int = 0
-    dropped: int = 0
-    """Commands that were not sent because no bridge was connected."""
-    invalid: int = 0
-    """Commands that were not sent because no motor could follow them."""
-    problem: str = ""
-    """Reason for the last rejected reading or command."""
+    dropped: int = 0  # commands that were not sent because no bridge was connected
+    invalid: int = 0  # commands that were not sent because no motor could follow them
+    problem: str = ""  # reason for the last rejected reading or command
+
+
+class CommandConflictDetector:
+    """Detects whether another program commands the motors.
+
+    LeRobot's bridge forwards the commands of all clients and does not identify them, but reports
+    the torque of every motor. A motor that follows our commands applies `MotorCommand.torque`; one
+    that keeps applying something else follows another program, the robot's own controller, or the
+    last command of a program that has ended. A publisher whose commands need no torque, such as
+    one that only damps a robot at rest, is not detected. Untested on hardware.
+    """
+
+    def __init__(self) -> None:
+        self._command = _NO_COMMAND
+        self._read_ns: int | None = None
+        self._restart()
+
+    def _restart(self) -> None:
+        self._deviating: Array = np.zeros(NUM_JOINTS)  # share of the readings
+        self._listened_s = 0.0
+
+    def record_command(self, command: MotorCommand) -> None:
+        """Record a command that was sent."""
+        self._command = command
+
+    def update(self, state: LowState) -> None:
+        """Process the next reading."""
+        assert state.motors is not None, "every rt/lowstate has torques"
+        now = state.time_ns
+        elapsed = math.inf if self._read_ns is None else (now - self._read_ns) / 1e9
+        self._read_ns = now
+        if elapsed > GAP_S:
+            self._restart()
+            return
+        expected = self._command.torque(state)
+        tolerance = _TOLERANCE + _RELATIVE_TOLERANCE * np.abs(expected)
+        deviates = np.abs(state.motors.torque - expected) > tolerance
+        self._deviating += (deviates - self._deviating) * (
+            1.0 - math.exp(-elapsed / _TIME_CONSTANT_S)
+        )
+        self._listened_s += elapsed
+
+    @property
+    def refusal(self) -> str:
+        """Why the robot must not be armed; empty: no other publisher within `LISTEN_S`."""
+        if self._listened_s < LISTEN_S:
+            return f"still listening for other publishers: {self._listened_s:.1f} of {LISTEN_S} s"
+        joint = int(np.argmax(self._deviating))
+        if self._deviating[joint] > _MAX_SHARE:
+            return (
+                f"the motor of {JOINT_NAMES[joint]} does not follow our commands: another program, "
+                "the robot's own controller, or the last command of a program that has ended "
+                "drives it; stop it, and damp the robot with its remote control"
+            )
+        return ""
 
 
 class BridgeRobot:
@@ -90,7 +181,7 @@ class BridgeRobot:
         self.arrivals = ArrivalMonitor()
         """Arrivals of usable readings; unusable messages count as lost."""
         self._conflicts = CommandConflictDetector()
-        self._filter = PlausibilityFilter(self.config.consistency)
+        self._filter = PlausibilityFilter()
         self._newest: LowState | None = None
         self._payload = b""
         self._mode: int | None = None  # of the first reading
@@ -100,11 +191,8 @@ class BridgeRobot:
         self._subscriber: Subscriber | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
-        """Wait up to ``timeout`` s for the first reading.
-
-        Raises:
-            EnvironmentFailure: no reading arrived, or it is of an unexpected robot.
-        """
+        """Wait up to ``timeout`` s for the first reading; raises `EnvironmentFailure` if none
+        arrived, or one of an unexpected robot."""
         self._open()
         deadline = time.monotonic() + timeout
         while self._newest is None and time.monotonic() < deadline:
@@ -113,7 +201,7 @@ class BridgeRobot:
         if newest is None:
             problem = self._timeout_reason(timeout)
         else:
-            problem = self._unexpected_mode() or variant_refusal(newest.mode, confirmed)
+            problem = self._unexpected_mode() or mode_refusal(newest.mode, confirmed)
         if problem:
             self.close()
             raise EnvironmentFailure(problem)
@@ -188,14 +276,12 @@ class BridgeRobot:
             self.counters.dropped += 1
         else:
             self.counters.sent += 1
-            self._conflicts.record_command(command, time.monotonic_ns())
+            self._conflicts.record_command(command)
 
     @property
     def refusal(self) -> str:
-        """Why the robot must not be armed now; empty: no reason.
-
-        An unexpected mode machine, or motors that follow other commands (`command_conflict`).
-        """
+        """Why the robot must not be armed now, because of its mode machine or other commands;
+        empty: no reason."""
         return self._unexpected_mode() or self._conflicts.refusal
 
     @property
@@ -219,7 +305,7 @@ class BridgeRobot:
     @property
     def warning(self) -> str:
         """Warning for the operator of this robot; empty: none."""
-        return "" if self._newest is None else variant_warning(self._newest.mode)
+        return "" if self._newest is None else mode_warning(self._newest.mode)
 
     def _unexpected_mode(self) -> str:
         found = self._newest.mode if self._newest else None

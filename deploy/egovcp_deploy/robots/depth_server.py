@@ -42,11 +42,8 @@ class DepthServerConfig:
 
 
 class DepthServer:
-    """Publishes each image of a `DepthCamera` once.
-
-    Raises:
-        EnvironmentFailure: the port is in use.
-    """
+    """Publishes each image of a `DepthCamera` once; raises `EnvironmentFailure` if the port is in
+    use."""
 
     def __init__(self, camera: DepthCamera, vertical_fov: float, host: str, port: int) -> None:
         self._camera, self._fov = camera, vertical_fov
@@ -84,11 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def serve(config: DepthServerConfig) -> None:
-    """Serve until interrupted.
-
-    Raises:
-        EnvironmentFailure: no driver, no such camera, or a port in use.
-    """
+    """Serve until interrupted; raises `EnvironmentFailure` for a missing driver or camera, or a
+    port in use."""
     camera = RealSenseDepthCamera.connect(config.camera)
     try:
         server = DepthServer(camera, config.camera.vertical_fov, config.host, config.port)

@@ -101,34 +101,23 @@ _JUMP_RATE: Final = _columns(1500.0, 700.0)  # rad/s^2
 class Contradiction(NamedTuple):
     """A reading that contradicts those before it."""
 
-    text: str
-    """Which quantity, with the values."""
-    jump: bool
-    """Whether only the speed jumped: no position or orientation contradicts it."""
+    text: str  # which quantity, with the values
+    jump: bool  # whether only the speed jumped: no position or orientation contradicts it
 
 
 class ReadingWindow(NamedTuple):
     """What the next reading is compared with: the window's first reading, and sums since then."""
 
     start_ns: int
-    position: Array
-    """(29,) rad, joints at the start."""
-    quaternion: Array
-    """(4,) pelvis at the start."""
-    accepted_speed: Array
-    """(32,) rad/s of the newest accepted reading: joints and gyroscope."""
-    time_ns: int
-    """Time of the newest reading."""
-    speed: Array
-    """(32,) rad/s of the newest reading."""
-    travel: Array
-    """(32,) rad, integral of the speed."""
-    speed_term: Array
-    """(32,) rad, sum |dv| (h/2 + lag)."""
-    fastest: Array
-    """(32,) rad/s, greatest absolute speed."""
-    interval_s: float
-    """Longest time between two readings."""
+    position: Array  # (29,) rad, joints at the start
+    quaternion: Array  # (4,) pelvis at the start
+    accepted_speed: Array  # (32,) rad/s of the newest accepted reading: joints and gyroscope
+    time_ns: int  # time of the newest reading
+    speed: Array  # (32,) rad/s of the newest reading
+    travel: Array  # (32,) rad, integral of the speed
+    speed_term: Array  # (32,) rad, sum |dv| (h/2 + lag)
+    fastest: Array  # (32,) rad/s, greatest absolute speed
+    interval_s: float  # longest time between two readings
 
     @classmethod
     def begin(cls, state: LowState) -> ReadingWindow:
@@ -138,12 +127,8 @@ class ReadingWindow(NamedTuple):
         return cls(*start, speed, state.time_ns, speed, zero, zero, np.abs(speed), 0.0)
 
     def extend(self, state: LowState) -> tuple[ReadingWindow, Contradiction | None]:
-        """Compare a reading within bounds with this window.
-
-        Returns:
-            The window with the reading, and what contradicts it. A contradicted reading never
-            begins a new window.
-        """
+        """Compare a reading within bounds with this window; returns the window with the reading,
+        and what contradicts it. A contradicted reading never begins a new window."""
         speed = _speed(state)
         interval = max(0.0, (state.time_ns - self.time_ns) * 1e-9)
         elapsed = (state.time_ns - self.start_ns) * 1e-9
@@ -179,11 +164,7 @@ class ReadingWindow(NamedTuple):
 
 
 def out_of_bounds(state: LowState) -> str:
-    """Describe a value that no G1 can measure; empty: none.
-
-    Args:
-        state: the reading, with `LowState.motors`.
-    """
+    """Describe a value that no G1 can measure; empty: none. ``state`` has `LowState.motors`."""
     assert state.motors is not None, "every rt/lowstate has torques"
     values = np.concatenate(
         [state.joint_position, state.joint_velocity, state.motors.torque, state.angular_velocity]
@@ -230,14 +211,9 @@ def _drift_text(i: int, change: Array, travel: Array, speed: Array, elapsed: flo
 
 
 class PlausibilityFilter:
-    """Checks the readings of one robot in the order of their arrival.
+    """Checks the readings of one robot in the order of their arrival."""
 
-    Args:
-        consistency: whether readings are also compared with those before them.
-    """
-
-    def __init__(self, consistency: bool = True) -> None:
-        self._consistency = consistency
+    def __init__(self) -> None:
         self._window: ReadingWindow | None = None
         self._candidate: ReadingWindow | None = None  # of the rejected readings
         self._candidate_ns = 0
@@ -246,11 +222,7 @@ class PlausibilityFilter:
         self._last_problem = ""
 
     def check(self, state: LowState) -> str:
-        """Return why the reading must not be used; empty: it is plausible.
-
-        Args:
-            state: the reading, with `LowState.motors`.
-        """
+        """Why a reading, with `LowState.motors`, must not be used; empty: it is plausible."""
         if problem := self._problem(state):
             self._last_problem = problem
             self._distrust = min(self._distrust + 1, _PROBATION)
@@ -262,8 +234,7 @@ class PlausibilityFilter:
         return ""
 
     def _problem(self, state: LowState) -> str:
-        problem = out_of_bounds(state)
-        if problem or not self._consistency:
+        if problem := out_of_bounds(state):
             return problem
         if self._window is None:
             self._window = ReadingWindow.begin(state)

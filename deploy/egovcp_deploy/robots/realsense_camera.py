@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,25 +55,19 @@ class Intrinsics:
 
     width: int
     height: int
-    fx: float
-    """Focal lengths, pixels."""
+    fx: float  # focal lengths, pixels
     fy: float
-    cx: float
-    """Principal point, pixels; the centre of the first pixel is 0."""
+    cx: float  # principal point, pixels; the centre of the first pixel is 0
     cy: float
 
 
 class DepthResampler:
-    """Resamples images of one camera to (48, 64).
+    """Resamples images of one camera to (48, 64), with ``vertical_fov`` rad.
 
     Output pixel (i, j) looks along ((j - 31.5) / f, (i - 23.5) / f, 1), right, down and forward,
     with f = 24 / tan(fov / 2), as in the simulated camera. Depth is planar in both. Each pixel is
     the lower median of the valid ones among nine input pixels around its ray, so it is always a
     measured depth: surfaces are never blended. With fewer than five valid ones it is invalid.
-
-    Args:
-        camera: of the input images.
-        vertical_fov: of the output images, rad.
     """
 
     def __init__(self, camera: Intrinsics, vertical_fov: float) -> None:
@@ -98,11 +92,8 @@ class DepthResampler:
         return float((self._index < len(self._flat) - 1).mean())
 
     def __call__(self, depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """(height, width) or (height, width, 1) mm, 0 invalid -> (48, 64) mm, 0 invalid.
-
-        Raises:
-            ValueError: the shape is not the camera's.
-        """
+        """(height, width) or (height, width, 1) mm, 0 invalid -> (48, 64) mm, 0 invalid; raises
+        `ValueError` for another shape."""
         if depth.shape[:2] != self._shape or depth.size != self._shape[0] * self._shape[1]:
             raise ValueError(f"a depth image of shape {depth.shape}, expected {self._shape}")
         self._flat[:-1] = depth.reshape(-1)
@@ -116,34 +107,12 @@ class DepthResampler:
         return np.asarray(resampled.reshape(DEPTH_ROWS, DEPTH_COLS), np.uint16)
 
 
-class RealSenseDriver(Protocol):
-    """The part of LeRobot's ``RealSenseCamera`` that is used."""
-
-    def read_latest_depth(self, max_age_ms: int = 500) -> NDArray[np.uint16]:
-        """(H, W, 1) mm; raises before the first image and if the newest is too old."""
-        ...
-
-    def disconnect(self) -> None:
-        """Stop the camera."""
-        ...
-
-
 class RealSenseDepthCamera:
-    """`DepthCamera` that reads LeRobot's camera, whose own thread waits for the hardware.
+    """`DepthCamera` that reads LeRobot's ``RealSenseCamera``, which is connected and has its own
+    thread; raises `EnvironmentFailure` if its field of view is smaller than the policy's."""
 
-    Args:
-        driver: connected.
-        intrinsics: of its depth images.
-        vertical_fov: of the policy's images, rad.
-
-    Raises:
-        EnvironmentFailure: its field of view is too small.
-    """
-
-    def __init__(
-        self, driver: RealSenseDriver, intrinsics: Intrinsics, vertical_fov: float
-    ) -> None:
-        self._driver: RealSenseDriver | None = driver
+    def __init__(self, driver: Any, intrinsics: Intrinsics, vertical_fov: float) -> None:
+        self._driver: Any | None = driver
         self._resample = DepthResampler(intrinsics, vertical_fov)
         if self._resample.coverage < _MIN_COVERAGE:
             raise EnvironmentFailure(
@@ -160,11 +129,8 @@ class RealSenseDepthCamera:
 
     @classmethod
     def connect(cls, config: RealSenseConfig) -> Self:
-        """Start the camera.
-
-        Raises:
-            EnvironmentFailure: the driver is not installed, or there is no such camera.
-        """
+        """Start the camera; raises `EnvironmentFailure` if its driver is not installed, or there is
+        no such camera."""
         driver = _start(config)
         try:
             return cls(driver, _intrinsics(driver), config.vertical_fov)

@@ -33,16 +33,11 @@ _MAX_AXIS: Final = 1.05  # a worn stick may exceed 1
 class RemoteControl:
     """Sticks and buttons."""
 
-    lx: float = 0.0
-    """Left stick, 1 is right."""
-    ly: float = 0.0
-    """Left stick, 1 is forward."""
-    rx: float = 0.0
-    """Right stick, 1 is right."""
-    ry: float = 0.0
-    """Right stick, 1 is forward."""
-    pressed: frozenset[str] = frozenset()
-    """Pressed buttons, of `BUTTONS`."""
+    lx: float = 0.0  # left stick, 1 is right
+    ly: float = 0.0  # left stick, 1 is forward
+    rx: float = 0.0  # right stick, 1 is right
+    ry: float = 0.0  # right stick, 1 is forward
+    pressed: frozenset[str] = frozenset()  # pressed buttons, of `BUTTONS`
 
     @classmethod
     def parse(cls, raw: bytes) -> RemoteControl | None:

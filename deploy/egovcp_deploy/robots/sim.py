@@ -9,26 +9,24 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import BasePose, CameraView, SceneObject
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.env import Observation, PrivilegedState, VectorEnv
 from egovcp.sim.tasks.base import Solid
+from egovcp.sim.tasks.registry import find_task
+from egovcp.spec import ACTION_TERMS
 from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
-_START_EVENTS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "passage begins"}
 #: Reward term -> event that is logged when the term is first nonzero in an episode.
 _TERM_EVENTS: Final = {
-    "block": "ball blocked by a hand",
-    "hit": "ball hit the body",
-    "brace": "hand braces on the wall",
-    "contact": "body touches the obstacle",
-    "head": "head touches the arch",
-    "pass": "arch passed",
+    "block": "blocked by a hand",
+    "hit": "body hit",
+    "pass": "passed",
     "fall": "robot fell",
 }
 
 
 class SimRobot:
-    """`LockstepRobot` whose rollout i is held-out scenario i of ``task`` and ``seed``."""
+    """Robot in lock-step whose rollout i is held-out scenario i of ``task`` and ``seed``."""
 
     def __init__(self, config: EnvConfig, task: str, seed: int) -> None:
         self._env = VectorEnv(config, num_envs=1)
@@ -64,14 +62,8 @@ class SimRobot:
     def observe(self) -> RobotObservation:
         """Return the observation, with the simulator's poses of pelvis and scene."""
         assert self._observation is not None, "start an episode first"
-        truth = self._env.privileged_state()
-        pelvis = truth.pelvis_w[0]
-        return RobotObservation(
-            depth=self._observation.depth[0],
-            state=self._observation.state[0],
-            base=BasePose(pelvis[:3].copy(), pelvis[3:].copy()),
-            scene=tuple(_scene_object(solid) for solid in truth.solids[0]),
-        )
+        poses = true_poses(self._env.privileged_state(), 0)
+        return RobotObservation(self._observation.depth[0], self._observation.state[0], *poses)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
         """Apply ``action`` for 40 ms of simulated time."""
@@ -85,6 +77,7 @@ class SimRobot:
             terminated=bool(result.terminated[0]),
             truncated=bool(result.truncated[0]),
             success=bool(result.success[0]),
+            parts=result.parts[0],
             events=tuple(self._events(terms)),
         )
 
@@ -92,8 +85,9 @@ class SimRobot:
         """Events that happened for the first time in this episode."""
         truth = self._env.privileged_state()
         begun = float(truth.since_event[0]) > 0.0
-        events = [_START_EVENTS[truth.task[0]]] if begun else []
-        events += [text for name, text in _TERM_EVENTS.items() if terms.get(name, 0.0) != 0.0]
+        events = [find_task(truth.task[0]).event] if begun else []
+        counted = [n for n, value in terms.items() if value != 0.0 and n not in ACTION_TERMS]
+        events += [_TERM_EVENTS.get(name, name) for name in counted]
         events = [text for text in events if text not in self._logged]
         self._logged.update(events)
         return events
@@ -105,6 +99,13 @@ class SimRobot:
     def close(self) -> None:
         """Stop the simulator's threads."""
         self._env.close()
+
+
+def true_poses(truth: PrivilegedState, row: int) -> tuple[BasePose, tuple[SceneObject, ...]]:
+    """Poses of pelvis and scene of one robot."""
+    pelvis = truth.pelvis_w[row]
+    scene = tuple(_scene_object(solid) for solid in truth.solids[row])
+    return BasePose(pelvis[:3].copy(), pelvis[3:].copy()), scene
 
 
 def _scene_object(solid: Solid) -> SceneObject:

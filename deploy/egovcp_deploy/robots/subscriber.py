@@ -44,10 +44,8 @@ _PROBE_S: Final = 1.0
 class ArrivalStats:
     """Statistics of the messages that arrived within a window."""
 
-    rate_hz: float = 0.0
-    """Usable messages per second."""
-    jitter_ms: float = 0.0
-    """99th percentile of |interval - median interval|."""
+    rate_hz: float = 0.0  # usable messages per second
+    jitter_ms: float = 0.0  # 99th percentile of |interval - median interval|
     gap_ms: float = 0.0
     """Longest time without a usable message, including the time since the last one."""
     lost: float = 0.0
@@ -55,12 +53,8 @@ class ArrivalStats:
 
 
 class ArrivalMonitor:
-    """Records arrival times. Thread-safe.
-
-    Args:
-        numbered: whether messages have sequence numbers, so that the caller reports losses through
-            `record_loss`; else losses are also estimated from intervals of several medians.
-    """
+    """Records arrival times; thread-safe. If messages are ``numbered``, the caller reports all
+    losses through `record_loss`; else they are also estimated from intervals of several medians."""
 
     def __init__(self, numbered: bool = False) -> None:
         self._numbered = numbered
@@ -104,11 +98,8 @@ class ArrivalMonitor:
 
 
 def connect_socket(end: zmq.Socket[bytes], host: str, port: int) -> None:
-    """Connect without waiting for an answer; a heartbeat detects a broken connection.
-
-    Raises:
-        EnvironmentFailure: the address is invalid.
-    """
+    """Connect without waiting for an answer; a heartbeat detects a broken connection. Raises
+    `EnvironmentFailure` if the address is invalid."""
     address = f"tcp://{host}:{port}"
     end.setsockopt(zmq.LINGER, 0)
     end.setsockopt(zmq.RECONNECT_IVL, 20)  # ms
@@ -124,11 +115,8 @@ def connect_socket(end: zmq.Socket[bytes], host: str, port: int) -> None:
 
 
 def bind_socket(end: zmq.Socket[bytes], host: str, port: int) -> int:
-    """Listen at ``host``; port 0 selects a free one. Returns the port.
-
-    Raises:
-        EnvironmentFailure: the port is in use, or the address is not of this machine.
-    """
+    """Listen at ``host`` and return the port; 0 selects a free one. Raises `EnvironmentFailure` if
+    it is in use, or the address is not of this machine."""
     end.setsockopt(zmq.LINGER, 0)
     try:
         end.bind(f"tcp://{host}:{port or '*'}")
@@ -161,17 +149,11 @@ def _waiting(end: zmq.Socket[bytes]) -> list[bytes]:
 
 
 class Subscriber:
-    """One subscription with its receiving thread.
+    """One subscription with its receiving thread; raises `EnvironmentFailure` if the address is
+    invalid. A message beyond ``max_bytes`` ends the connection, which is then renewed.
 
-    Args:
-        host: of the publisher.
-        port: of the publisher.
-        max_bytes: a longer message ends the connection, which is then renewed.
-        handle: called in the thread with a message and its arrival time (monotonic ns), newest
-            message first until one is usable; returns whether the message was usable.
-
-    Raises:
-        EnvironmentFailure: the address is invalid.
+    ``handle`` is called in the thread with a message and its arrival time (monotonic ns), newest
+    message first, until it returns that one was usable.
     """
 
     def __init__(

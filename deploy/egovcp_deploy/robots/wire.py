@@ -6,9 +6,9 @@
                                        imu_state, wireless_remote, mode_machine}}
 
 Per motor a state may also have ``temperature`` (deg C: one number, as LeRobot's bridge sends it,
-or casing and winding, as the robot does), ``motorstate`` (status bits), ``lost`` (packets) and
-``mode`` (1: enabled). Names and meanings are those of Unitree's ``MotorState_``. An optional field
-that is absent or invalid is not reported; the rest of the state is used.
+or casing and winding, as the robot does), ``motorstate`` (status bits) and ``mode`` (1: enabled),
+named as in Unitree's ``MotorState_``. An optional field that is absent or invalid is not reported;
+the rest of the state is used.
 
 The first 29 of the 35 motors are ``spec.JOINT_NAMES`` in order; the others are not fitted. Received
 messages may be damaged or hostile: every required value is checked, and an invalid message raises
@@ -92,14 +92,10 @@ class LowCommand:
     """One ``rt/lowcmd`` as the robot receives it."""
 
     motors: MotorCommand
-    velocity: Array
-    """(29,) rad/s, target of the damping term."""
-    torque: Array
-    """(29,) N m, added to the controller's."""
-    enabled: NDArray[np.bool_]
-    """(29,) motors that must follow the command."""
-    series: bool
-    """Whether ankles and waist are commanded as pitch and roll."""
+    velocity: Array  # (29,) rad/s, target of the damping term
+    torque: Array  # (29,) N m, added to the controller's
+    enabled: NDArray[np.bool_]  # (29,) motors that must follow the command
+    series: bool  # whether ankles and waist are commanded as pitch and roll
 
 
 def fault_text(bits: int) -> str:
@@ -111,12 +107,8 @@ def fault_text(bits: int) -> str:
 
 
 def encode_command(command: MotorCommand) -> bytes:
-    """Encode a ``rt/lowcmd``.
-
-    Raises:
-        MalformedMessage: a value has the wrong shape or sign, or is out of bounds; the command
-            must not be sent.
-    """
+    """Encode a ``rt/lowcmd``; raises `MalformedMessage` if a value has the wrong shape or sign, or
+    is out of bounds: the command must not be sent."""
     position = _checked(command.position, _MAX_ANGLE, "position")
     target = np.asarray(command.position)
     outside = (target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)
@@ -146,11 +138,7 @@ def _checked(values: Array, most: float, name: str, minimum: float = -np.inf) ->
 
 
 def decode_command(payload: bytes) -> LowCommand:
-    """Decode a ``rt/lowcmd``; the robot's side of `encode_command`.
-
-    Raises:
-        MalformedMessage: the message is not a valid command.
-    """
+    """Decode a ``rt/lowcmd``, as the robot does; raises `MalformedMessage`."""
     data = _data(payload, COMMAND_TOPIC)
     motors = _motors(data, "motor_cmd")
 
@@ -172,12 +160,8 @@ def decode_command(payload: bytes) -> LowCommand:
 
 
 def encode_state(state: LowState, acceleration: Array) -> bytes:
-    """Encode a ``rt/lowstate`` as LeRobot's bridge sends it.
-
-    Args:
-        state: the reading, with `LowState.motors`; ``command_sources`` is omitted if it is None.
-        acceleration: (3,) specific force in the IMU frame, m/s^2.
-    """
+    """Encode a ``rt/lowstate`` as LeRobot's bridge sends it; ``state`` has `LowState.motors`, and
+    ``acceleration`` (3,) is the specific force in the IMU frame, m/s^2."""
     assert state.motors is not None, "every rt/lowstate has torques"
     columns = {
         "q": state.joint_position.tolist(),
@@ -200,17 +184,12 @@ def encode_state(state: LowState, acceleration: Array) -> bytes:
         "wireless_remote": base64.b64encode(state.remote).decode("ascii"),
         "mode_machine": state.mode,
     }
-    if state.command_sources is not None:
-        data["command_sources"] = state.command_sources
     return json.dumps({"topic": STATE_TOPIC, "data": data}).encode()
 
 
 def decode_state(payload: bytes, time_ns: int) -> LowState:
     """Decode a ``rt/lowstate`` that arrived at ``time_ns``; the result has `LowState.motors`.
-
-    Raises:
-        MalformedMessage: the message is not a valid state.
-    """
+    Raises `MalformedMessage`."""
     data = _data(payload, STATE_TOPIC)
     motors = _motors(data, "motor_state")
     imu = data.get("imu_state")
@@ -220,7 +199,6 @@ def decode_state(payload: bytes, time_ns: int) -> LowState:
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
         raise MalformedMessage(f"the quaternion has length {norm:.2f}, expected 1")
-    has_sources = data.get("command_sources") is not None
     return LowState(
         time_ns=time_ns,
         joint_position=_numbers([m.get("q") for m in motors], _MAX_ANGLE, "q"),
@@ -230,7 +208,6 @@ def decode_state(payload: bytes, time_ns: int) -> LowState:
         mode=_mode(data, "mode_machine"),
         remote=_remote(data.get("wireless_remote", "")),
         motors=_motor_readings(motors),
-        command_sources=_mode(data, "command_sources") if has_sources else None,
     )
 
 
@@ -311,7 +288,6 @@ def _motor_readings(motors: Sequence[dict[str, Any]]) -> MotorReadings:
         torque=_numbers([m.get("tau_est") for m in motors], _MAX_TORQUE, "tau_est"),
         temperature=_temperatures([motor.get("temperature") for motor in motors]),
         faults=_integers([motor.get("motorstate") for motor in motors]),
-        lost=_integers([motor.get("lost") for motor in motors]),
         enabled=None if modes is None else modes == _ENABLED,
     )
 
@@ -324,8 +300,6 @@ def _encode_optional_fields(motors: MotorReadings) -> dict[str, list[Any]]:
         fields["temperature"] = [row[0] if len(row) == 1 else row for row in rows]
     if motors.faults is not None:
         fields["motorstate"] = motors.faults.tolist()
-    if motors.lost is not None:
-        fields["lost"] = motors.lost.tolist()
     if motors.enabled is not None:
         fields["mode"] = motors.enabled.astype(int).tolist()
     return fields

@@ -46,14 +46,10 @@ _START: Final = "start egovcp-depth-server where the camera is, or egovcp-fake-g
 class DepthFrame:
     """One depth image with the header of its message."""
 
-    sequence: int
-    """Number of the image, counted by the server."""
-    vertical_fov: float
-    """rad."""
-    depth: NDArray[np.uint16]
-    """(48, 64) mm, 0 invalid."""
-    age_s: float = math.nan
-    """Time from capture to sending; NaN if unknown."""
+    sequence: int  # number of the image, counted by the server
+    vertical_fov: float  # rad
+    depth: NDArray[np.uint16]  # (48, 64) mm, 0 invalid
+    age_s: float = math.nan  # time from capture to sending; NaN if unknown
 
 
 def encode_frame(frame: DepthFrame) -> bytes:
@@ -65,11 +61,8 @@ def encode_frame(frame: DepthFrame) -> bytes:
 
 
 def decode_frame(message: bytes) -> DepthFrame:
-    """Decode a message.
-
-    Raises:
-        MalformedMessage: it is damaged, of another format or of another image size.
-    """
+    """Decode a message; raises `MalformedMessage` if it is damaged, of another format or image
+    size."""
     if len(message) != FRAME_BYTES:
         raise MalformedMessage(f"a depth image of {len(message)} bytes, expected {FRAME_BYTES}")
     magic, sequence, rows, columns, fov, crc = _HEADER.unpack_from(message)
@@ -119,11 +112,8 @@ class ZmqDepthCamera:
         self._subscriber: Subscriber | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
-        """Wait up to ``timeout`` s for the first image.
-
-        Raises:
-            EnvironmentFailure: none arrived, or of another field of view.
-        """
+        """Wait up to ``timeout`` s for the first image; raises `EnvironmentFailure` if none
+        arrived, or one of another field of view."""
         config = self.config
         self._subscriber = Subscriber(config.host, config.port, FRAME_BYTES, self._handle)
         deadline = time.monotonic() + timeout

@@ -37,17 +37,17 @@ def make_evaluator(model: WorldModel, config: PlannerConfig) -> PlanEvaluator[Ca
     if backend == "eager" or (backend == "auto" and type(model) is not WorldModel):
         return ReferenceEvaluator(model, config)
     if backend == "int8":
-        return _integers(model, config)
+        return _int8_evaluator(model, config)
     if backend == "auto" and model.state_mean.device.type == "cpu" and library.processor_is_fast():
         try:
             if library.library_if_possible() is not None:
-                return _integers(model, config)
+                return _int8_evaluator(model, config)
         except UsageError as error:
             library.warn_float32(str(error))
     return FloatEvaluator(model, config)
 
 
-def _integers(model: WorldModel, config: PlannerConfig) -> Int8Evaluator:
+def _int8_evaluator(model: WorldModel, config: PlannerConfig) -> Int8Evaluator:
     device = model.state_mean.device
     if device.type != "cpu":
         raise UsageError(f"backend=int8 runs on the CPU, the model is on {device}")

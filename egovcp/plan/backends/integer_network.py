@@ -85,7 +85,7 @@ class IntegerNetwork:
         self._threads.evaluate(
             network=ctypes.addressof(self._packed.network),
             prefix=ctypes.addressof(prefix.struct),
-            rows=plans,
+            plans=plans,
             steps=steps,
             actions=actions.data_ptr(),
             noise=None if noise is None else noise.data_ptr(),
@@ -108,7 +108,7 @@ class _Packed:
         if 2 * c.latent > MAX_NARROW:
             raise UsageError(
                 f"a latent of {c.latent}: the int8 planner takes up to {MAX_NARROW // 2}; "
-                f"{library.OTHERWISE}"
+                f"{library.FLOAT32_HINT}"
             )
         self.network = n = library.CNetwork()
         n.hidden, n.latent, n.actions = c.hidden, c.latent, spec.ACTION_DIM
@@ -235,7 +235,7 @@ class _Packed:
         if outputs % LANES or outputs > MAX_WIDE:
             raise UsageError(
                 f"a layer of {outputs} units: the int8 planner takes multiples of {LANES} up to "
-                f"{MAX_WIDE}; {library.OTHERWISE}"
+                f"{MAX_WIDE}; {library.FLOAT32_HINT}"
             )
         layer = library.CLayer()
         layer.outputs, layer.epsilon = outputs, epsilon
@@ -248,7 +248,7 @@ class _Packed:
         weight = F.pad(weight.detach().float(), (0, -weight.shape[1] % self._layout.depth))
         outputs, inputs = weight.shape
         if inputs > MAX_WIDE:
-            raise UsageError(f"a layer of {inputs} inputs; {library.OTHERWISE}")
+            raise UsageError(f"a layer of {inputs} inputs; {library.FLOAT32_HINT}")
         scale = weight.abs().amax(1).clamp_min(1e-12) / LEVELS
         whole = (weight / scale[:, None]).round()
         total = whole.sum(1)

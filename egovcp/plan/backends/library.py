@@ -35,7 +35,7 @@ FLAGS: Final = (
     "-fPIC",
 )
 WITHOUT_TILES: Final = "-DWITHOUT_TILES"
-OTHERWISE: Final = "plan with --planner.backend=float32"
+FLOAT32_HINT: Final = "plan with --planner.backend=float32"
 
 
 _F, _I, _P = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
@@ -81,7 +81,7 @@ class CHead(ctypes.Structure):
 class CReadout(ctypes.Structure):
     _fields_ = (
         *_fields(_I, "objective rule bins"),
-        ("each", _P),
+        ("bin_values", _P),
         *_fields(_F, "mean std floor threshold discount"),
     )
 
@@ -114,7 +114,7 @@ class CThreadPool(ctypes.Structure):
 class CJob(ctypes.Structure):
     _fields_ = (
         *_fields(_P, "network prefix"),
-        *_fields(_I, "rows steps"),
+        *_fields(_I, "plans steps"),
         *_fields(_P, "actions noise values"),
         ("pool", CThreadPool),
     )
@@ -185,10 +185,12 @@ def library() -> ctypes.CDLL:
         content = _cached(name, flags)
         kernel = load_library(content, name)
     except EnvironmentFailure as error:
-        raise EnvironmentFailure(f"the int8 planner cannot be used: {error}; {OTHERWISE}") from None
+        raise EnvironmentFailure(
+            f"the int8 planner cannot be used: {error}; {FLOAT32_HINT}"
+        ) from None
     except OSError as error:
         raise EnvironmentFailure(
-            f"the int8 planner cannot be compiled or loaded ({error}); {OTHERWISE}"
+            f"the int8 planner cannot be compiled or loaded ({error}); {FLOAT32_HINT}"
         ) from error
     for name, result, *arguments in (
         ("evaluate", None, _P),

@@ -1,18 +1,47 @@
-"""The contact tasks: ball, wall and arch, and several of them in one episode."""
+"""Contact tasks: the base class of tasks, how they are found, and those that egovcp ships."""
 
 from __future__ import annotations
 
-from typing import Final
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot
-from egovcp.sim.scenario import SEQUENCE, Scenario
-from egovcp.sim.tasks.base import Task
-from egovcp.sim.tasks.sequence import SINGLE, SequenceTask
+from egovcp.bounds import bounded
+from egovcp.sim.tasks.options import EpisodeConfig, Range, TaskConfig
+from egovcp.sim.tasks.registry import find_task, register_task, task_entries, task_names
 
-_TASKS: Final[dict[str, type[Task]]] = {**SINGLE, SEQUENCE: SequenceTask}
+if TYPE_CHECKING:
+    from egovcp.sim.scene import HANDS, HEAD, LEG, PARTS, TORSO, Contact
+    from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+
+__all__ = [
+    "HANDS",
+    "HEAD",
+    "LEG",
+    "PARTS",
+    "TORSO",
+    "Array",
+    "Contact",
+    "EpisodeConfig",
+    "ObjectState",
+    "Range",
+    "Solid",
+    "Task",
+    "TaskConfig",
+    "bounded",
+    "find_task",
+    "register_task",
+    "task_entries",
+    "task_names",
+]
+
+#: Imported on first use, because it needs MuJoCo; a robot has options without the simulator.
+_MODULES = {
+    **dict.fromkeys(("HANDS", "HEAD", "LEG", "PARTS", "TORSO", "Contact"), "egovcp.sim.scene"),
+    **dict.fromkeys(("Array", "ObjectState", "Solid", "Task"), "egovcp.sim.tasks.base"),
+}
 
 
-def make_task(config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> Task:
-    """The task of ``scenario``; samples its geometry and writes it into the robot's model."""
-    return _TASKS[scenario.task](config, scenario, robot)
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

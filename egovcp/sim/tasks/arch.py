@@ -1,26 +1,32 @@
 """Traverse the arch: duck under a lintel that an upright robot would hit.
 
-With ``motion="walk"`` the robot walks to a fixed arch, and the velocity command steers it onto the
-middle of the arch. With ``rail`` the robot stands and the arch moves towards it at the commanded
-speed. The arch is kinematic: contacts do not move it.
+The robot walks to the arch, and the velocity command steers it onto the middle of the arch. The
+arch is kinematic: contacts do not move it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
 
+import mujoco
 import numpy as np
 
-from egovcp.sim.config import ArchConfig, EnvConfig
-from egovcp.sim.robot import Contact, SimulatedRobot
-from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import ARCH, ARCH_GEOMS, HEAD, PARTS
-from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
-from egovcp.spec import ACTION_HANDS, PHYSICS_DT
+from egovcp.bounds import bounded
+from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
+from egovcp.spec import ACTION_BOX
 
-_OTHERS: Final = [part for part in range(len(PARTS)) if part != HEAD]
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
+    from egovcp.sim.robot import SimulatedRobot
+    from egovcp.sim.scenario import Scenario
+    from egovcp.sim.scene import Contact
+
+ARCH: Final = "arch"
+_GEOMS: Final = ("arch_left_post", "arch_right_post", "arch_lintel")
 _POST_HALF_WIDTH: Final = 0.06  # m
 _BEHIND: Final = 0.25  # m, an arch this far behind the pelvis has been passed
 # Steering of a walking robot.
@@ -28,32 +34,69 @@ _SIDE_GAIN: Final = 0.5  # 1/s
 _MOST_SIDEWAYS: Final = 0.1  # m/s
 _TURN_GAIN: Final = 1.0  # 1/s
 _MOST_TURNING: Final = 0.3  # rad/s
+# The oracle.
+_DUCK_FROM: Final = 0.75  # m, arch ahead of the pelvis
+_DUCK_UNTIL: Final = -0.30  # m
+_DUCK_BELOW: Final = 0.61  # m, of the pelvis below the lintel
+
+
+@dataclass(frozen=True)
+class ArchConfig(TaskConfig):
+    """An arch that an upright robot would hit and a crouched one passes under."""
+
+    clearance_range: Range = bounded((1.16, 1.24), least=0.5, most=3)
+    """Lower edge of the lintel above ground, m."""
+    width_range: Range = bounded((1.1, 1.5), least=0.4, most=10)
+    """Free width between the posts, m."""
+    depth_range: Range = bounded((0.10, 0.20), least=0.01, most=5)
+    """Thickness of posts and lintel along the direction of passage, m."""
+    lintel_height: float = bounded(0.35, least=0.01, most=5)
+    """Height of the lintel beam, m."""
+    distance_range: Range = bounded((1.6, 2.2), least=0.4, most=20)
+    """Centre of the arch before the pelvis at the start, m."""
+    lateral_range: Range = bounded((-0.08, 0.08), least=-5, most=5)
+    """Centre of the arch left of the pelvis, m."""
+    speed_range: Range = bounded((0.3, 0.5), least=0.01, most=2)
+    """Commanded forward velocity, m/s."""
+    pass_reward: float = bounded(1.0, least=0, most=MAX_REWARD)
+    """Once, when the arch has been passed without any contact."""
+    hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
+    """Once, when any part of the robot touches the arch."""
 
 
 class ArchTask(Task):
-    """One arch, which starts to move at the event."""
+    """One arch, which the robot starts to walk to at the event."""
 
-    config: ArchConfig
-    terms: ClassVar = ("progress", "pass", "head", "contact", "crouch", "pose", "fall")
+    name = ARCH
+    description = "walk up to an arch that is too low for an upright robot, and duck under it"
+    terms: ClassVar = {"pass": "pass", "hit": "hit"}
+    config: ArchConfig = ArchConfig()
+    event = "passage begins"
+    episode = EpisodeConfig(ticks=230, event_ticks=(5, 25))  # covers the slowest passage
+    event_ticks = 175
+    needs_walking = True
+    in_sequence = "anywhere"
+    constant_poses = ((0.0,), (0.0,), (0.0,), (0.0, -0.2, -0.4, -0.6, -0.8, -1.0))
+    seed_key = 2
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
-        self.config = config.arch
-        names = ("clearance", "width", "depth", "distance", "lateral", "speed")
-        sampled = self._sample(scenario, *names)
+        sampled = self.sample("clearance", "width", "depth", "distance", "lateral", "speed")
         self.clearance, self.speed = sampled["clearance"], sampled["speed"]
         self._half_width, self._half_depth = sampled["width"] / 2, sampled["depth"] / 2
         self._ahead = sampled["distance"]  # arch centre ahead of the pelvis now, m
         self._touched = False
         self._passed = False
-        self._progress = 0.0  # m in this tick
         self._body = robot.model.body(ARCH)
         self._mocap = int(self._body.mocapid[0])
         self._shape_arch()
 
-    @property
-    def parameters(self) -> dict[str, float]:
-        return self._parameters | {"distance": self._ahead}
+    @classmethod
+    def add_objects(cls, spec: mujoco.MjSpec) -> None:
+        body = spec.worldbody.add_body(name=ARCH, mocap=True, pos=[20, 0, 0])
+        for name in _GEOMS:
+            box = mujoco.mjtGeom.mjGEOM_BOX
+            body.add_geom(name=name, type=box, size=[0.1, 0.1, 0.1], contype=1, conaffinity=0)
 
     def _shape_arch(self) -> None:
         """Write the sizes of posts and lintel; the arch's origin is its centre on the ground."""
@@ -67,45 +110,34 @@ class ArchTask(Task):
             (post, (0.0, -aside, post_half)),
             (lintel, (0.0, 0.0, above)),
         )
-        for name, (size, centre) in zip(ARCH_GEOMS, boxes, strict=True):
+        for name, (size, centre) in zip(_GEOMS, boxes, strict=True):
             self.robot.shape_geom(self.robot.model.geom(name).id, size, centre)
 
     def place(self) -> None:
-        pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
-        self._direction, self._start = heading[:, 0].copy(), pelvis.copy()
-        self._origin = pelvis + heading @ np.array([0.0, self._parameters["lateral"], 0.0])
-        self._origin[2] = 0.0
+        data, heading = self.robot.data, self.robot.heading
+        self._direction, self._start = heading[:, 0].copy(), data.qpos[:3].copy()
+        centre = self._start + heading @ np.array([self._ahead, self.parameters["lateral"], 0.0])
         turn = math.atan2(heading[1, 0], heading[0, 0])
-        quaternion = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-        self.robot.data.mocap_quat[self._mocap] = quaternion
-        self._put()
-
-    def _put(self) -> None:
-        self.robot.data.mocap_pos[self._mocap] = self._origin + self._ahead * self._direction
+        data.mocap_pos[self._mocap] = [centre[0], centre[1], 0.0]
+        data.mocap_quat[self._mocap] = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
 
     def park(self) -> None:
         self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
     @property
-    def moving(self) -> bool:
-        """Whether the robot is commanded to walk, or the arch moves."""
-        return self.since_event >= 0.0
+    def under_way(self) -> bool:
+        """Whether the robot is commanded to walk: from the event to the passage."""
+        return self.since_event >= 0.0 and not self._passed
 
     @property
     def velocity_command(self) -> Array:
-        """(3,) see `Task`; forward, and back onto the course, from the event to the passage."""
-        if not self.moving or (self._walks and self._passed):
+        """(3,) see `Task`; forward, and back onto the course, while `under_way`."""
+        if not self.under_way:
             return np.zeros(3)
-        if not self._walks:
-            return np.array([self.speed, 0.0, 0.0])
         aside, turned = self._off_course()
         sideways = min(max(-_SIDE_GAIN * aside, -_MOST_SIDEWAYS), _MOST_SIDEWAYS)
         turning = min(max(-_TURN_GAIN * turned, -_MOST_TURNING), _MOST_TURNING)
         return np.array([self.speed, sideways, turning])
-
-    @property
-    def _walks(self) -> bool:
-        return self.config.motion == "walk"
 
     def _off_course(self) -> tuple[float, float]:
         """Pelvis left of the course (m), and its heading relative to the course (rad)."""
@@ -114,39 +146,20 @@ class ArchTask(Task):
         forward = self.robot.heading[:, 0]
         return aside, math.atan2(float(forward @ left), float(forward @ ahead))
 
-    def begin_tick(self) -> None:
-        super().begin_tick()
-        self._progress = 0.0
-
     def before_step(self) -> None:
-        """Move the arch along the rail, or measure how far the robot has walked."""
-        before = self._ahead
-        if self._walks:
-            arch = self.robot.data.mocap_pos[self._mocap]
-            self._ahead = float((arch - self.robot.data.qpos[:3]) @ self._direction)
-        elif self.moving:
-            self._ahead -= self.speed * PHYSICS_DT
-            self._put()
-        if self.moving:
-            self._progress += before - self._ahead
+        """Measure how far the arch is ahead."""
+        arch = self.robot.data.mocap_pos[self._mocap]
+        self._ahead = float((arch - self.robot.data.qpos[:3]) @ self._direction)
 
     def process_contacts(self, contacts: Sequence[Contact]) -> None:
         self._touched = self._touched or bool(contacts)
 
-    def rewards(self, action: Array) -> dict[str, float]:
+    def rewards(self) -> dict[str, float]:
         c = self.config
-        passes = not self._passed and self._ahead + self._half_depth < -_BEHIND
-        under_way = self.moving and not self._passed
-        self._passed = self._passed or passes
-        needless = abs(self._ahead) > c.near or self._passed
-        crouch = max(0.0, -float(action[6]))
+        self._passed = self._passed or self._ahead + self._half_depth < -_BEHIND
         return {
-            "progress": c.progress_reward * self._progress * under_way,
-            "pass": c.pass_reward * (passes and not self._touched),
-            "head": -c.head_cost * bool(self.forces[HEAD] > 0.0),
-            "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
-            "crouch": -c.crouch_cost * crouch * needless,
-            "pose": -c.pose_cost * float(np.mean(action[ACTION_HANDS] ** 2)),
+            "pass": c.pass_reward * self.once("pass", self._passed and not self._touched),
+            "hit": -c.hit_cost * self.once("hit", self._touched),
         }
 
     @property
@@ -159,16 +172,11 @@ class ArchTask(Task):
         return self._passed
 
     def state(self) -> ObjectState:
-        velocity = -self.speed * (self.moving and not self._walks) * self._direction
-        position = self.robot.data.mocap_pos[self._mocap].copy()
-        return ObjectState(position, velocity, self.clearance, self.moving and not self._passed)
+        edge = self.robot.data.mocap_pos[self._mocap] + [0.0, 0.0, self.clearance]
+        return ObjectState(edge, np.zeros(3), self.clearance, self.under_way)
 
-    def solids(self) -> tuple[Solid, ...]:
-        model, data = self.robot.model, self.robot.data
-        found = []
-        for name in ARCH_GEOMS:
-            geom = model.geom(name).id
-            size = tuple(float(s) for s in model.geom_size[geom])
-            centre, turn = data.geom_xpos[geom].copy(), data.mocap_quat[self._mocap].copy()
-            found.append(Solid(name, "box", (size[0], size[1], size[2]), centre, turn))
-        return tuple(found)
+    def oracle(self) -> Array:
+        """Squat as deep as the clearance requires while the arch is near."""
+        if not self.under_way or not _DUCK_UNTIL < self.object_b[0] < _DUCK_FROM:
+            return np.zeros(7)
+        return self.action_of(height=max(self.clearance - _DUCK_BELOW, ACTION_BOX.low[-1]))

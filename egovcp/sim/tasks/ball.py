@@ -8,35 +8,84 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import mujoco
 import numpy as np
 
-from egovcp.sim.config import BallConfig, EnvConfig
-from egovcp.sim.robot import Contact, SimulatedRobot
-from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import BALL, HANDS, HEAD, LEG, TORSO
+from egovcp.bounds import bounded
+from egovcp.sim.scene import HANDS, HEAD, LEG, TORSO, Contact
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
+    from egovcp.sim.robot import SimulatedRobot
+    from egovcp.sim.scenario import Scenario
+
+BALL: Final = "ball"
 _PARKED: Final = np.array([-20.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # behind the robot, unseen
 _AT_REST: Final = np.zeros(6)
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
 _HALF_EDGE: Final = (math.pi / 6) ** (1 / 3)  # of a cube, in radii of the ball of its volume
 _TUMBLE: Final = 6.0  # rad/s, the most that a box turns about each axis
+# The oracle.
+_LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
+_BLOCK_AHEAD: Final = 0.32  # m, of the hand that waits for the ball from the pelvis
+_HAND_OFFSET: Final = (0.03, 0.0, 0.0)  # m, middle of the hand capsule from the palm site
+
+
+@dataclass(frozen=True)
+class BallConfig(TaskConfig):
+    """A ball thrown at the upper body; a first contact with hand or wrist blocks it."""
+
+    shape: Literal["sphere", "box"] = "sphere"
+    """Shape: a ball, or a tumbling cube of the same volume."""
+    radius_range: Range = bounded((0.09, 0.12), least=0.01, most=0.3)
+    """Radius of the ball, m."""
+    mass_range: Range = bounded((0.15, 0.35), least=0.001, most=10)
+    """Mass of the ball, kg."""
+    distance_range: Range = bounded((2.5, 3.5), least=0.6, most=10)
+    """Horizontal distance of the release point from the pelvis, m."""
+    bearing_range: Range = bounded((-0.30, 0.30), least=-math.pi, most=math.pi)
+    """Direction of the release point seen from the pelvis, rad, 0 is straight ahead."""
+    release_height_range: Range = bounded((0.7, 1.4), least=0.1, most=5)
+    """Height of the release point above ground, m."""
+    flight_range: Range = bounded((0.65, 0.95), least=0.2, most=5)
+    """Time from release to the aim point, s."""
+    aim_forward: float = bounded(0.10, least=-1, most=1)
+    """Aim point in front of the pelvis, m, heading frame."""
+    aim_lateral_range: Range = bounded((-0.40, 0.40), least=-2, most=2)
+    """Aim point left of the pelvis, m, heading frame."""
+    aim_height_range: Range = bounded((0.10, 0.50), least=-1, most=2)
+    """Aim point above the pelvis, m."""
+    grace: float = bounded(0.3, least=0, most=60)
+    """Contacts within this time after a block do not count, s."""
+    block_reward: float = bounded(1.0, least=0, most=MAX_REWARD)
+    """Once, at a first contact with a hand or wrist."""
+    hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
+    """Once, when the ball touches torso, head or leg."""
 
 
 class BallTask(Task):
     """One throw at the upper body, at the event."""
 
-    config: BallConfig
-    terms: ClassVar = ("block", "hit", "pose", "fall")
+    name = BALL
+    description = "block a thrown ball with hand or wrist before it meets the body"
+    terms: ClassVar = {"block": "block", "hit": "hit"}
+    config: BallConfig = BallConfig()
+    event = "ball thrown"
+    short_episode = EpisodeConfig(ticks=60, event_ticks=(4, 20))
+    event_ticks = 25
+    in_sequence = "anywhere"
+    constant_poses = ((0.2, 0.45, 0.8), (0.0, -0.3, -0.6), (0.35, 0.6, 0.85), (0.0,))
+    seed_key = 0
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
-        self.config = config.ball
         at_release = ("radius", "mass", "distance", "bearing", "release_height", "flight")
-        sampled = self._sample(scenario, *at_release, "aim_lateral", "aim_height")
+        sampled = self.sample(*at_release, "aim_lateral", "aim_height")
         self.radius, self.flight = sampled["radius"], sampled["flight"]
         aim = (self.config.aim_forward, sampled["aim_lateral"], sampled["aim_height"])
         self._aim_b = np.array(aim)
@@ -45,9 +94,17 @@ class BallTask(Task):
         self._grounded = False  # on the floor: contacts no longer count
         self._blocked_at: float | None = None
         self.hit = False
-        self._new_block = False
-        self._new_hit = False
+        joint = robot.model.body(BALL).jntadr[0]
+        first, velocity = robot.model.jnt_qposadr[joint], robot.model.jnt_dofadr[joint]
+        self._qpos, self._qvel = slice(first, first + 7), slice(velocity, velocity + 6)
         self._shape_ball()
+
+    @classmethod
+    def add_objects(cls, spec: mujoco.MjSpec) -> None:
+        body = spec.worldbody.add_body(name=BALL, pos=[-20, 0, 1])
+        body.add_freejoint()
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        body.add_geom(name=BALL, type=sphere, size=[0.1, 0, 0], mass=0.25, contype=1, conaffinity=1)
 
     def _attitude(self, scenario: Scenario) -> tuple[Array, Array]:
         """Quaternion and angular velocity (rad/s) at the release; constant for a ball."""
@@ -74,9 +131,9 @@ class BallTask(Task):
         kinds = mujoco.mjtGeom
         model.geom_type[geom] = kinds.mjGEOM_BOX if self._is_box else kinds.mjGEOM_SPHERE
         self.robot.shape_geom(geom, size if self._is_box else size[:1], [0.0, 0.0, 0.0])
-        model.body_mass[body] = self._parameters["mass"]
+        model.body_mass[body] = self.parameters["mass"]
         share = 2 / 3 if self._is_box else 2 / 5
-        model.body_inertia[body] = share * self._parameters["mass"] * size[0] ** 2
+        model.body_inertia[body] = share * self.parameters["mass"] * size[0] ** 2
 
     def place(self) -> None:
         self.park()
@@ -85,8 +142,8 @@ class BallTask(Task):
         self._set_ball(_PARKED, _AT_REST)
 
     def _set_ball(self, pose: Array, velocity: Array) -> None:
-        self.robot.data.qpos[-7:] = pose
-        self.robot.data.qvel[-6:] = velocity
+        self.robot.data.qpos[self._qpos] = pose
+        self.robot.data.qvel[self._qvel] = velocity
 
     def before_step(self) -> None:
         """Keep the ball parked until the event, then throw it."""
@@ -103,10 +160,10 @@ class BallTask(Task):
         """Release point and velocity, world, aimed at the robot as it stands now."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         aim = pelvis + heading @ self._aim_b
-        bearing = self._parameters["bearing"]
+        bearing = self.parameters["bearing"]
         away = np.array([math.cos(bearing), math.sin(bearing), 0.0])
-        start = pelvis + heading @ away * self._parameters["distance"]
-        start[2] = self._parameters["release_height"]
+        start = pelvis + heading @ away * self.parameters["distance"]
+        start[2] = self.parameters["release_height"]
         return start, (aim - start) / self.flight - 0.5 * _GRAVITY * self.flight
 
     def process_contacts(self, contacts: Sequence[Contact]) -> None:
@@ -116,10 +173,15 @@ class BallTask(Task):
         parts = {contact.part for contact in contacts}
         if not self.blocked and not self.hit and parts & set(HANDS):
             self._blocked_at = self.time
-            self._new_block = True
         elif not self._in_grace and not self.hit and parts & {TORSO, HEAD, LEG}:
-            self.hit = self._new_hit = True
-        self._grounded = bool(self.robot.data.qpos[-5] < self.radius + 0.01)
+            self.hit = True
+        self._grounded = bool(self._pose[2] < self.radius + 0.01)
+
+    @property
+    def _pose(self) -> Array:
+        """(7,) position m and quaternion of the ball, world."""
+        pose: Array = self.robot.data.qpos[self._qpos].copy()
+        return pose
 
     @property
     def blocked(self) -> bool:
@@ -131,13 +193,10 @@ class BallTask(Task):
         """Whether contacts do not count, shortly after a block."""
         return self._blocked_at is not None and self.time - self._blocked_at < self.config.grace
 
-    def rewards(self, action: Array) -> dict[str, float]:
-        block, self._new_block = self._new_block, False
-        hit, self._new_hit = self._new_hit, False
+    def rewards(self) -> dict[str, float]:
         return {
-            "block": self.config.block_reward * block,
-            "hit": -self.config.hit_cost * hit,
-            "pose": -self.config.pose_cost * float(np.mean(action**2)),
+            "block": self.config.block_reward * self.once("block", self.blocked),
+            "hit": -self.config.hit_cost * self.once("hit", self.hit),
         }
 
     @property
@@ -150,17 +209,26 @@ class BallTask(Task):
         return self._grounded
 
     def state(self) -> ObjectState:
-        data = self.robot.data
         over = self._grounded or self.hit or self.blocked
         if not self._thrown:
             nothing = np.full(3, np.nan)
             return ObjectState(nothing, nothing.copy(), self.radius, active=False)
-        return ObjectState(
-            data.qpos[-7:-4].copy(), data.qvel[-6:-3].copy(), self.radius, active=not over
-        )
+        velocity = self.robot.data.qvel[self._qvel][:3].copy()
+        return ObjectState(self._pose[:3], velocity, self.radius, active=not over)
+
+    def oracle(self) -> Array:
+        """Put the nearer hand where the ball will cross a plane ahead of the body."""
+        state = self.state()
+        if not state.active:
+            return np.zeros(7)
+        t = _LOOKAHEAD[:, None]
+        path = self.object_b + self.to_body(state.velocity_w) * t + 0.5 * _GRAVITY * t * t
+        point = path[np.argmin(np.abs(path[:, 0] - _BLOCK_AHEAD))]
+        target = point - _HAND_OFFSET
+        return self.action_of(left=target) if point[1] > 0 else self.action_of(right=target)
 
     def solids(self) -> tuple[Solid, ...]:
         if not self._thrown:
             return ()
-        pose = self.robot.data.qpos[-7:].copy()
+        pose = self._pose
         return (Solid(BALL, self.config.shape, self._half_sizes, pose[:3], pose[3:]),)

@@ -8,36 +8,119 @@ is parked, and the next part begins around the robot at its current pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import ClassVar, Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Final
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import Contact, SimulatedRobot
-from egovcp.sim.scenario import Scenario
+import mujoco
+
+from egovcp.bounds import bounded, check_bounds
+from egovcp.errors import UsageError
 from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.sim.tasks.options import MAX_TICKS, EpisodeConfig
+from egovcp.sim.tasks.registry import find_task
 from egovcp.sim.tasks.wall import WallTask
+from egovcp.spec import REWARD_TERMS
 
-SINGLE: Final[dict[str, type[Task]]] = {"ball": BallTask, "wall": WallTask, "arch": ArchTask}
+if TYPE_CHECKING:
+    from egovcp.sim.config import BaseEnvConfig, EnvConfig
+    from egovcp.sim.robot import SimulatedRobot
+    from egovcp.sim.scenario import Scenario
+    from egovcp.sim.scene import Contact
+
+#: Tasks whose objects are in every sequence, in the order of the compiled scene.
+_ALWAYS: Final = (ArchTask, WallTask, BallTask)
+
+
+@dataclass(frozen=True)
+class SequenceConfig:
+    """Several tasks in one episode, in turn (--task=sequence)."""
+
+    parts: tuple[str, ...] = ("arch", "ball", "wall")
+    """Its tasks in their order, each at most once. The wall, on which the robot leans, can only be
+    the last."""
+    pause_ticks: int = bounded(25, least=0, most=MAX_TICKS)
+    """Planner ticks from the end of a part (arch passed, ball on the floor) to the next one. A part
+    ends at the latest after the ticks of its own episodes."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+def _parts(config: BaseEnvConfig) -> list[type[Task]]:
+    return [find_task(name) for name in config.options_of(SequenceTask.name).parts]
 
 
 class SequenceTask(Task):
     """Plays its parts in turn; the rewards are those of the current part."""
 
-    terms: ClassVar = tuple(dict.fromkeys(term for kind in SINGLE.values() for term in kind.terms))
+    name = "sequence"
+    description = "several tasks in one episode, in turn"
+    terms: ClassVar = {}
+    config: SequenceConfig = SequenceConfig()
+    episode = None
+    for_training = False
+    constant_poses = ((0.2, 0.45), (0.0, -0.3), (0.35, 0.6), (0.0, -0.6, -1.0))
+    seed_key = 3
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
         made = {
-            name: kind(config, replace(scenario, task=name), robot) for name, kind in SINGLE.items()
+            task.name: task(config, replace(scenario, task=task.name), robot)
+            for task in self.scene_tasks(config)
         }
         self._all = tuple(made.values())  # the others stay parked
-        self._parts = tuple(made[name] for name in config.sequence.parts)
-        self._pause = config.sequence.pause_ticks
+        self._parts = tuple(made[name] for name in self.config.parts)
+        self._pause = self.config.pause_ticks
         self._at = 0
         self._finished_ticks = 0
         self.event_tick = self._parts[0].event_tick
+        for part in self._parts:
+            event = part.event_tick
+            drawn = part.parameters | {"event_tick": -1 if event is None else event}
+            self.parameters |= {f"{part.name}.{name}": value for name, value in drawn.items()}
+        terms = {name: column for task in self._all for name, column in task.reward_terms.items()}
+        order = dict.fromkeys((*REWARD_TERMS, *terms))
+        self._terms = {name: terms[name] for name in order}
+
+    @classmethod
+    def add_objects(cls, spec: mujoco.MjSpec) -> None:
+        """Nothing: see `scene_tasks`."""
+
+    @classmethod
+    def scene_tasks(cls, config: BaseEnvConfig) -> tuple[type[Task], ...]:
+        return tuple(dict.fromkeys((*_ALWAYS, *_parts(config))))
+
+    @classmethod
+    def walks(cls, config: BaseEnvConfig) -> bool:
+        return any(part.walks(config) for part in _parts(config))
+
+    @classmethod
+    def episode_config(cls, config: BaseEnvConfig) -> EpisodeConfig:
+        """The length of all parts and the timing of the first."""
+        parts = [part.episode_config(config) for part in _parts(config)]
+        return replace(parts[0], ticks=sum(part.ticks for part in parts))
+
+    @classmethod
+    def check_options(cls, config: BaseEnvConfig) -> None:
+        parts = config.options_of(cls.name).parts
+        if not parts or len(set(parts)) < len(parts):
+            raise UsageError(
+                f"env.sequence.parts={list(parts)}: expected at least one task, each at most once"
+            )
+        for name in parts:
+            place = find_task(name, "env.sequence.parts").in_sequence
+            if place == "no":
+                raise UsageError(f"env.sequence.parts: {name} cannot be part of a sequence")
+            if place == "last" and name != parts[-1]:
+                raise UsageError(
+                    f"env.sequence.parts={list(parts)}: expected {name} only at the end"
+                )
+
+    @property
+    def reward_terms(self) -> dict[str, str]:
+        return self._terms
 
     @property
     def _part(self) -> Task:
@@ -46,16 +129,6 @@ class SequenceTask(Task):
     @property
     def current_name(self) -> str:
         return self._part.name
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Those of every part, prefixed by its name; event ticks count from its begin, -1: none."""
-        drawn: dict[str, float] = {}
-        for part in self._parts:
-            drawn |= {f"{part.name}.{name}": value for name, value in part.parameters.items()}
-            event = part.event_tick
-            drawn[f"{part.name}.event_tick"] = -1 if event is None else event
-        return drawn
 
     @property
     def since_event(self) -> float:
@@ -103,8 +176,11 @@ class SequenceTask(Task):
     def process_contacts(self, contacts: Sequence[Contact]) -> None:
         self._part.after_step(contacts)
 
-    def rewards(self, action: Array) -> dict[str, float]:
-        return dict.fromkeys(self.terms, 0.0) | self._part.rewards(action)
+    def rewards(self) -> dict[str, float]:
+        return dict.fromkeys(self._terms, 0.0) | self._part.rewards()
+
+    def oracle(self) -> Array:
+        return self._part.oracle()
 
     @property
     def fall_cost(self) -> float:

@@ -1,56 +1,106 @@
-"""Brace against the wall: pushed at a wall, stay up and contact it with the hands only."""
+"""Brace against the wall: pushed at a wall, stay up and touch it with the hands only."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
 
+import mujoco
 import numpy as np
 
-from egovcp.sim.config import EnvConfig, WallConfig
-from egovcp.sim.robot import Contact, SimulatedRobot
-from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import HANDS, PARTS, WALL, WALL_HALF_SIZE
-from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.bounds import bounded
+from egovcp.sim.scene import HANDS, Contact
+from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import PHYSICS_DT
 
-_HANDS: Final = list(HANDS)
-_OTHERS: Final = [part for part in range(len(PARTS)) if part not in HANDS]
-_BRACE_FORCE: Final = 5.0  # N, a hand that presses less only brushes the wall
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
+    from egovcp.sim.robot import SimulatedRobot
+    from egovcp.sim.scenario import Scenario
+
+WALL: Final = "wall"
+_HALF_SIZE: Final = (0.05, 1.5, 1.3)  # m: thickness, width, height
+# The oracle.
+_PRESS: Final = 0.05  # m, hand targets behind the wall's surface
+_PRESS_ASIDE: Final = 0.20  # m, left and right
+_PRESS_HEIGHT: Final = 0.10  # m, above the pelvis
+
+
+@dataclass(frozen=True)
+class WallConfig(TaskConfig):
+    """A wall before the robot, which is pushed towards it; only hands may touch."""
+
+    distance_range: Range = bounded((0.60, 0.70), least=0.3, most=10)
+    """Wall surface before the pelvis, m."""
+    yaw_range: Range = bounded((-0.10, 0.10), least=-1, most=1)
+    """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
+    friction_range: Range = bounded((0.6, 1.0), least=0, most=5)
+    """Sliding friction of the wall."""
+    push_speed_range: Range = bounded((0.70, 1.00), least=0, most=5)
+    """Change of base velocity by a push towards the wall, m/s; calibrated for the controller walk
+    (benchmarks/tasks.py)."""
+    push_bearing_range: Range = bounded((-0.20, 0.20), least=-math.pi, most=math.pi)
+    """Direction of a push towards the wall, rad from straight ahead."""
+    away_probability: float = bounded(0.1, least=0, most=1)
+    """Share of the pushes that go away from the wall."""
+    away_speed_range: Range = bounded((0.05, 0.15), least=0, most=5)
+    """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
+    push_time: float = bounded(0.02, least=0.005, most=1)
+    """Time over which a push acts, s."""
+    disturbed_time: float = bounded(1.0, least=0, most=3600)
+    """Time after a push in which the scripted oracle presses its hands on the wall, s."""
+    hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
+    """Once, when anything but a hand touches the wall."""
+
+
+def add_wall(spec: mujoco.MjSpec) -> None:
+    """Add a wall as a mocap body; its origin is on the surface, its x axis points into it."""
+    body = spec.worldbody.add_body(name=WALL, mocap=True, pos=[20, 0, 0])
+    centre, box = [_HALF_SIZE[0], 0, _HALF_SIZE[2]], mujoco.mjtGeom.mjGEOM_BOX
+    size = list(_HALF_SIZE)
+    body.add_geom(name=WALL, type=box, size=size, pos=centre, contype=1, conaffinity=0, priority=1)
 
 
 class WallTask(Task):
     """One push, towards the wall or (sometimes) away from it, at the event."""
 
-    config: WallConfig
-    terms: ClassVar = ("brace", "upright", "contact", "impact", "pose", "guard", "fall")
+    name = WALL
+    description = "brace with the hands on a wall when pushed towards it"
+    terms: ClassVar = {"hit": "hit"}
+    config: WallConfig = WallConfig()
+    event = "robot pushed"
+    short_episode = EpisodeConfig(ticks=100, event_ticks=(4, 30))
+    in_sequence = "last"  # the robot leans on it
+    constant_poses = ((0.4, 0.8, 1.0), (0.0, -0.3), (0.3, 0.55, 0.8), (0.0,))
+    seed_key = 1
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
-        self.config = config.wall
         c = self.config
-        sampled = self._sample(scenario, "distance", "yaw", "friction")
+        sampled = self.sample("distance", "yaw", "friction")
         push = scenario.rng("push")
         self.away = bool(push.random() < c.away_probability)
         self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
-        towards, disturbed = c.push_speed_range, c.disturbed_time
-        assert towards is not None, "call `EnvConfig.for_controller` first"
-        assert disturbed is not None, "call `EnvConfig.for_controller` first"
-        self._disturbed_time = disturbed
-        speed = c.away_speed_range if self.away else towards
+        speed = c.away_speed_range if self.away else c.push_speed_range
         self.push_speed = float(push.uniform(*speed))
-        sampled |= {"push_speed": self.push_speed, "push_bearing": self._bearing}
-        self._touched_otherwise = False
+        self.parameters |= {"push_speed": self.push_speed, "push_bearing": self._bearing}
+        self._hit = False
         self._body = robot.model.body(WALL)
         self._mocap = int(self._body.mocapid[0])
         robot.model.geom(WALL).friction[0] = sampled["friction"]
 
+    @classmethod
+    def add_objects(cls, spec: mujoco.MjSpec) -> None:
+        add_wall(spec)
+
     def place(self) -> None:
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
-        self._surface = pelvis + heading @ np.array([self._parameters["distance"], 0.0, 0.0])
+        self._surface = pelvis + heading @ np.array([self.parameters["distance"], 0.0, 0.0])
         self._surface[2] = 0.0
-        turn = math.atan2(heading[1, 0], heading[0, 0]) + self._parameters["yaw"]
+        turn = math.atan2(heading[1, 0], heading[0, 0]) + self.parameters["yaw"]
         data, quaternion = self.robot.data, (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
         data.mocap_pos[self._mocap], data.mocap_quat[self._mocap] = self._surface, quaternion
         self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
@@ -70,33 +120,20 @@ class WallTask(Task):
     def process_contacts(self, contacts: Sequence[Contact]) -> None:
         """Remember any contact that was not a hand's."""
         if any(contact.part not in HANDS for contact in contacts):
-            self._touched_otherwise = True
+            self._hit = True
 
     @property
     def disturbed(self) -> bool:
-        """Whether the last push is recent enough for bracing to be rewarded."""
-        return 0.0 <= self.since_event <= self._disturbed_time
+        """Whether the push is recent."""
+        return 0.0 <= self.since_event <= self.config.disturbed_time
 
-    def rewards(self, action: Array) -> dict[str, float]:
-        c = self.config
-        hand_force = float(self.forces[_HANDS].max())
-        upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
-        pose = float(np.mean(action**2))
-        leaning = bool(self.forces[_OTHERS].any())
-        braced = hand_force > _BRACE_FORCE and not leaning and not self.away
-        return {
-            "brace": c.brace_reward * upright * braced,
-            "upright": c.upright_reward * upright,
-            "contact": -c.contact_cost * leaning,
-            "impact": -c.impact_cost * min(1.0, hand_force / c.impact_force),
-            "pose": -c.pose_cost * pose,
-            "guard": -c.guard_cost * pose if self.since_event < 0.0 else 0.0,
-        }
+    def rewards(self) -> dict[str, float]:
+        return {"hit": -self.config.hit_cost * self.once("hit", self._hit)}
 
     @property
     def achieved(self) -> bool:
         """Nothing but hands has touched the wall."""
-        return not self._touched_otherwise
+        return not self._hit
 
     def state(self) -> ObjectState:
         """Where the pelvis' x axis meets the wall; active while disturbed towards it."""
@@ -105,8 +142,10 @@ class WallTask(Task):
         point = pelvis + gap * forward
         return ObjectState(point, np.zeros(3), math.nan, self.disturbed and not self.away)
 
-    def solids(self) -> tuple[Solid, ...]:
-        centre = self._surface + WALL_HALF_SIZE[0] * self._normal
-        centre[2] = WALL_HALF_SIZE[2]
-        quaternion = self.robot.data.mocap_quat[self._mocap].copy()
-        return (Solid(WALL, "box", WALL_HALF_SIZE, centre, quaternion),)
+    def oracle(self) -> Array:
+        """After a push towards the wall, press both hands on it."""
+        if not self.state().active:
+            return np.zeros(7)
+        ahead = self.object_b[0] + _PRESS
+        left, right = (ahead, _PRESS_ASIDE, _PRESS_HEIGHT), (ahead, -_PRESS_ASIDE, _PRESS_HEIGHT)
+        return self.action_of(left, right)

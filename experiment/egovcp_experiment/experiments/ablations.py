@@ -20,7 +20,7 @@ SUMMARY: Final = "what each choice of the world model is worth on held-out episo
 _PRESETS: Final = (
     *("paper", "kl_equal", "kl_tenfold", "no_free_nats", "free_nats_per_dimension"),
     *("pixels_summed", "state_summed", "state_1", "no_moving", "no_multistep", "no_near"),
-    *("value_weight_1", "q_of_posterior_only"),
+    *("value_weight_1", "q_of_posterior_only", "no_object", "monte_carlo", "no_sampled_actions"),
 )
 #: Choice -> changed flags of egovcp-train.
 CHOICES: Final[dict[str, Flags]] = {

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from egovcp.robot.controllers import WALK, make_controller
-from egovcp.sim.config import STANDING_PUSHES, STEPPING_PUSHES
-from egovcp.sim.scenario import SEQUENCE
+from egovcp.sim.tasks.sequence import SequenceTask
+from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
@@ -83,7 +82,7 @@ class _Condition:
 def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
     """Condition -> changed flags of scenes, none for the first; of a sequence those whose parts are
     all among the tasks."""
-    if task == SEQUENCE:
+    if task == SequenceTask.name:
         return {
             name: flags
             for name, flags in _SEQUENCES.items()
@@ -91,21 +90,14 @@ def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
         }
     own = {TRAINED: {}, **_OWN[task]}
     if task == "wall":
-        low, high = _push_speeds(config)
+        low, high = WallConfig().push_speed_range
         own["harder"] = {"env.wall.push_speed_range": [high, high + (high - low) / 2]}
     return {**own, **_SENSING}
 
 
-def _push_speeds(config: ExperimentConfig) -> tuple[float, float]:
-    """Range of push speeds for the low-level controller, m/s."""
-    scenes = dict(flag.removeprefix("--").split("=", 1) for flag in config.scenes)
-    walks = make_controller(scenes.get("env.controller", WALK)).walks
-    return STEPPING_PUSHES if walks else STANDING_PUSHES
-
-
 def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
     """Task -> its chosen conditions; with --only, also the first one of each task that has any."""
-    every = {task: conditions(config, task) for task in (*config.tasks, SEQUENCE)}
+    every = {task: conditions(config, task) for task in (*config.tasks, SequenceTask.name)}
     if not config.only:
         return {task: config.chosen(row) for task, row in every.items() if row}
     wanted = config.chosen({name: 0 for row in every.values() for name in row})
@@ -124,7 +116,7 @@ def _plays(grid: Grid) -> dict[str, dict[str, tuple[list[str], str]]]:
                 grid.plays(
                     task,
                     Variant(f"in_{name}", play=flags),
-                    ALL if task == SEQUENCE else task,
+                    ALL if task == SequenceTask.name else task,
                 ),
                 grid.references(task, f"references-{task}-{name}", flags, _REFERENCES).name,
             )
@@ -149,7 +141,7 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
         "same delays) show how hard a condition is: where the oracle fails, too, it may be "
         "infeasible."
     ]
-    if SEQUENCE in plays:
+    if SequenceTask.name in plays:
         parts.append(
             "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
             "played by the model of all tasks, whose input names neither tasks nor times. Each "

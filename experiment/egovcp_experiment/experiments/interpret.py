@@ -26,8 +26,6 @@ from egovcp_experiment.studies.open_loop import HORIZONS
 SUMMARY: Final = (
     "value maps of a hand, open-loop images, and behaviour with and without events (fig. 7)"
 )
-#: Ticks ahead at which the errors on the ball are summarised.
-BALL_HORIZONS: Final = (4, 8, 12, 16)
 #: Study -> its tasks; empty: all.
 STUDIES: Final[dict[str, tuple[str, ...]]] = {
     "value_maps": ("ball",),
@@ -148,37 +146,9 @@ def _open_loop(task: str, found: Mapping[str, Any]) -> _Section:
             f"{100 * last['model_moving']:.0f} cm, that of repeating the last image "
             f"{100 * last['repeat_moving']:.0f} cm"
         )
-    if "ball_images" in last:
-        head = ("ticks ahead", "images of the ball", "model (cm)", "repeat (cm)", "detected")
-        title = (
-            "ball: depth of the ball's pixels in the decoded image; detected: the median error is "
-            "below 30 cm"
-        )
-        ball = tuple((k, *_ball_columns(row)) for k, row in errors.items())
-        parts.append(Table(title, head, ball))
-        lines += _ball_conclusion(errors)
     if found["strips"]:
         parts.append(_strip_plot(task, found["strips"]))
     return lines, parts
-
-
-def _ball_columns(row: Mapping[str, Any]) -> tuple[str, ...]:
-    depths = (_centimetres(row["model_ball"]), _centimetres(row["repeat_ball"]))
-    return (str(row["ball_images"]), *depths, percent(row["ball_detected"]))
-
-
-def _ball_conclusion(errors: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    rows = [errors[str(k)] for k in BALL_HORIZONS]
-    if all(row["model_ball"] is None for row in rows):
-        return []
-    model, repeat = (
-        ", ".join(_centimetres(row[name], ".0f") for row in rows)
-        for name in ("model_ball", "repeat_ball")
-    )
-    return [
-        f"ball: {', '.join(map(str, BALL_HORIZONS))} ticks ahead, the depth of the ball in the "
-        f"decoded image is off by {model} cm; repeating the last image by {repeat} cm"
-    ]
 
 
 def _centimetres(metres: float | None, form: str = ".1f") -> str:
@@ -246,7 +216,7 @@ def _behaviour_conclusion(task: str, found: Mapping[str, Any]) -> list[str]:
         return [
             f"wall: {percent(untouched['share'])} of undisturbed scenes without contact (bar 95 %)"
             f"; hands back after {percent(back['share'])} of {back['episodes']} recoveries, of "
-            f"{found['pushed']} pushes towards the wall; a brace is rewarded for "
+            f"{found['pushed']} pushes towards the wall; the oracle braces for "
             f"{found['braced_for_s']:g} s"
         ]
     if task == "arch" and found["pelvis_far"]["mean"] is not None:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from egovcp.errors import UsageError
+from egovcp.sim.config import evaluation_config
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
 from egovcp_experiment.config import ExperimentConfig
@@ -18,7 +19,6 @@ from egovcp_experiment.report import ExperimentReport, Part, percent
 
 SUMMARY: Final = "PPO, the model-free baseline, along its training, next to the planner"
 _PLANNER: Final = "planner"
-_TICKS: Final[Mapping[str, float]] = {"ball": 150.0, "wall": 150.0, "arch": 230.0}
 
 
 def ppo_plays(grid: Grid, task: str) -> dict[int, list[str]]:
@@ -58,7 +58,7 @@ def steps_per_episode(grid: Grid, task: str, records: results.Records) -> float:
     """Planner ticks per episode of the collected data; the default for an existing dataset."""
     data = grid.data(task)
     if isinstance(data, ExternalPath) or data.cell not in records:
-        return _TICKS[task]
+        return float(evaluation_config().episode(task).ticks)
     figures = records[data.cell]["figures"]
     return float(figures["steps"] / figures["episodes"])
 

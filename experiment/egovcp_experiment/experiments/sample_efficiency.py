@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from egovcp.spec import TASKS
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
-from egovcp_experiment.config import EpisodesConfig, ExperimentConfig
+from egovcp_experiment.config import TASKS, EpisodesConfig, ExperimentConfig
 from egovcp_experiment.experiments.ppo import (
     ppo_plays,
     ppo_scores,

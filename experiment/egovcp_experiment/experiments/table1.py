@@ -221,11 +221,7 @@ def judge(
 ) -> Verdict | None:
     """The verdict from the trainings that both rows have; None without any.
 
-    Args:
-        claim: the claim.
-        task: played task.
-        rows: row -> training seed -> name of the cell.
-        records: results.
+    ``rows``: row -> training seed -> name of the cell.
     """
     above, below = rows.get(claim.above, {}), rows.get(claim.below, {})
     both = [s for s in above if above[s] in records and below.get(s) in records]

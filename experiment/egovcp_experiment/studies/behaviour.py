@@ -7,7 +7,6 @@ arch   height of the pelvis near an arch and far from it
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from egovcp.artifact import Artifact
 from egovcp.intervals import bootstrap, wilson
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import resolve_config
-from egovcp.spec import PLANNER_HZ, TASKS
+from egovcp.spec import PLANNER_HZ
+from egovcp_experiment.config import TASKS
 from egovcp_experiment.studies import study
 
 #: A robot has recovered when its pelvis is slower than this for half a second.
@@ -28,7 +27,7 @@ _REST_TICKS: Final = PLANNER_HZ // 2
 NEAR_NEUTRAL_M: Final = 0.10  # distance at which a hand is back at its start
 BACK_TICKS: Final = 2 * PLANNER_HZ
 STANDING_M: Final = 0.70
-_PASSED_M: Final = 0.9  # distance behind the pelvis at which any arch has been passed
+FAR_M: Final = 0.9  # distance at which an arch needs no crouch
 
 type Array = NDArray[np.float64]
 
@@ -80,10 +79,10 @@ class BehaviourTrace:
         back = bool((window < NEAR_NEUTRAL_M).any())
         return back if back or len(window) == BACK_TICKS else None
 
-    def far(self, near: float) -> NDArray[np.bool_]:
-        """(T,) whether the arch is further ahead than ``near``, m, or passed."""
-        ahead = np.array(self.ahead)
-        far: NDArray[np.bool_] = (ahead > near) | (ahead < -_PASSED_M)
+    @property
+    def far(self) -> NDArray[np.bool_]:
+        """(T,) whether the arch is further than `FAR_M` from the pelvis."""
+        far: NDArray[np.bool_] = np.abs(self.ahead) > FAR_M
         return far
 
 
@@ -133,7 +132,7 @@ def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str,
     back = [flag for trace in pushed if (flag := trace.hands_back) is not None]
     return {
         "undisturbed_without_contact": _share([not trace.touched for trace in empty]),
-        "braced_for_s": resolve_config(config.env).wall.disturbed_time,
+        "braced_for_s": config.env.wall.disturbed_time,
         "hands_back": _share(back),
         "pushed": len(pushed),
         "recovered": len(back),
@@ -142,12 +141,11 @@ def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str,
 
 
 def _arch(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
-    near = config.env.arch.near
-    heights = [np.array(t.pelvis)[t.far(near)] for t in [*eventful, *empty]]
+    heights = [np.array(t.pelvis)[t.far] for t in [*eventful, *empty]]
     return {
         "pelvis_far": _means(heights),
         "standing_far": _means([(part > STANDING_M).astype(float) for part in heights]),
-        "pelvis_near": _means([np.array(t.pelvis)[~t.far(near)] for t in eventful]),
+        "pelvis_near": _means([np.array(t.pelvis)[~t.far] for t in eventful]),
     }
 
 
@@ -167,8 +165,7 @@ def _means(parts: Sequence[Array]) -> dict[str, Any]:
     return {"mean": float(means.mean()), "ci95": list(interval), "episodes": len(means)}
 
 
-CONFIG = BehaviourConfig
-main = study.make_main("behaviour", CONFIG, measure)
+main = study.make_main("behaviour", BehaviourConfig, measure)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main())

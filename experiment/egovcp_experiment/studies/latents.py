@@ -7,7 +7,6 @@ the tick they explain.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -16,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egovcp.errors import UsageError
-from egovcp.spec import TASKS
+from egovcp.bounds import bounded
+from egovcp_experiment.config import TASKS
 from egovcp_experiment.studies import study
 
 _NEIGHBOURS: Final = 10
@@ -31,16 +30,12 @@ class LatentsConfig(study.SimStudyConfig):
     """Unused; see --tasks."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to play."""
-    points: int = 1200
+    points: int = bounded(1200, least=4)
     """States in a map, evenly spread over all steps."""
-    perplexity: float = 30.0
-    """Perplexity of t-SNE."""
 
 
 def measure(config: LatentsConfig) -> None:
     """Play, and write the maps."""
-    if config.points < 4 or not config.tasks:
-        raise UsageError("--points must be at least 4, and --tasks name a task")
     artifact = config.load()
     rows: list[tuple[Tensor, Tensor, int, int, int]] = []
     for number, name in enumerate(config.tasks):
@@ -58,12 +53,12 @@ def measure(config: LatentsConfig) -> None:
         "tick": tick.tolist(),
     }
     for name, points in (("h", torch.stack(h)), ("z", torch.stack(z))):
-        flat = tsne_map(points, config.perplexity).round(3).tolist()
+        flat = tsne_map(points).round(3).tolist()
         figures[name] = neighbours(points, task, episode, tick) | {"map": flat}
     config.write(figures)
 
 
-def tsne_map(points: Tensor, perplexity: float) -> NDArray[np.float64]:
+def tsne_map(points: Tensor, perplexity: float = 30.0) -> NDArray[np.float64]:
     """(n, d) points -> (n, 2) by t-SNE; at most n / 3 neighbours count."""
     from sklearn.manifold import TSNE  # takes seconds
 
@@ -111,8 +106,7 @@ def _tick_r2(tick: Tensor, task: Tensor, same: Tensor, index: Tensor) -> float |
     return 1 - error / total if total > 0 else None
 
 
-CONFIG = LatentsConfig
-main = study.make_main("latents", CONFIG, measure)
+main = study.make_main("latents", LatentsConfig, measure)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main())

@@ -7,7 +7,6 @@ with many candidates. All searches are timed in turns, so that other load affect
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.errors import UsageError
+from egovcp.bounds import bounded
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.plan.config import OptimiserName
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM
@@ -40,16 +39,14 @@ _MOST: Final = 65_536
 class PlanTimeConfig(study.StudyConfig):
     """Find the number of candidates that each search can evaluate in equal time."""
 
-    budget_ms: float = 40.0
+    budget_ms: float = bounded(40.0, above=0)
     """Time for a plan of one robot, ms."""
-    rounds: int = 9
+    rounds: int = bounded(9, least=1)
     """Timed plans of each search."""
 
 
 def measure(config: PlanTimeConfig) -> None:
     """Time the searches and write the numbers of candidates."""
-    if config.budget_ms <= 0 or config.rounds < 1:
-        raise UsageError("--budget_ms must be above 0, and --rounds at least 1")
     artifact = config.load()
     policies = {}
     for name, (optimiser, iterations) in SEARCHES.items():
@@ -110,8 +107,7 @@ def _affordable(
     }
 
 
-CONFIG = PlanTimeConfig
-main = study.make_main("plan_time", CONFIG, measure)
+main = study.make_main("plan_time", PlanTimeConfig, measure)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main())

@@ -16,7 +16,6 @@ There are two kinds of plans: the planner's own, which maximise Q^, and random o
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact, returns_of
+from egovcp.bounds import bounded
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.search import random_walk
@@ -48,26 +48,14 @@ type Array = NDArray[np.float64]
 class ResidualsConfig(study.SimStudyConfig):
     """Errors of Q along plans, one plan of each kind per episode."""
 
-    branches: int = 12
+    branches: int = bounded(12, least=2)
     """Random walks per step of a plan; their mean return is the target of Q."""
-    eta: float = ACTION_ETA
+    eta: float = bounded(ACTION_ETA, above=0, most=2)
     """Step size of the data's random walk, as in egovcp-collect."""
-    step_ticks: tuple[int, int] = (1, 1)
+    step_ticks: tuple[int, int] = bounded((1, 1), least=1)
     """Shortest and longest time between two steps of the walk, planner ticks."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box."""
-
-    def check(self) -> None:
-        """Raise `UsageError` for invalid values."""
-        self.require_task(_AFTER)
-        if self.branches < 2:
-            raise UsageError(f"--branches={self.branches}: expected at least 2")
-        least, most = self.step_ticks
-        if not 1 <= least <= most or not 0 < self.eta <= 2:
-            raise UsageError(
-                f"--eta={self.eta} --step_ticks={[least, most]}: expected a step within the box, "
-                "at most 2, and 1 <= shortest <= longest; the data's card says how its walk stepped"
-            )
 
 
 @dataclass
@@ -122,7 +110,7 @@ def _values(model: WorldModel, carry: Carry, plan: Array) -> Array:
 
 def measure(config: ResidualsConfig) -> None:
     """Plan, branch, and write the analysis."""
-    config.check()
+    config.require_task(_AFTER)
     artifact = config.load()
     if not artifact.manifest.get("train_config", {}).get("returns"):
         raise UsageError(f"{artifact.path} does not say which return it was trained on")
@@ -260,8 +248,7 @@ def bounds(n: int, sigma_min: float, sigma_max: float, rho: float) -> tuple[floa
     return max(low, 0.0), (n + rho * pairs) / n**2 * sigma_max**2
 
 
-CONFIG = ResidualsConfig
-main = study.make_main("residuals", CONFIG, measure)
+main = study.make_main("residuals", ResidualsConfig, measure)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main())

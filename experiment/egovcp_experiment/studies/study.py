@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
+from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
@@ -24,6 +25,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.env import Observation, PrivilegedState, StepResult, VectorEnv
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_experiment.cell import RESULT
 
 _SEED: Final = 4_000_000_000  # added to seeds: no collection or evaluation has these scenarios
@@ -70,9 +72,9 @@ class StudyConfig:
 class SimStudyConfig(StudyConfig):
     """Options of the studies in simulation."""
 
-    task: str = "ball"
+    task: str = DEFAULT_TASK
     """Task to play."""
-    episodes: int = 16
+    episodes: int = bounded(16, least=1)
     """Number of scenarios."""
     seed: int = 0
     """Seed of the scenarios."""
@@ -80,14 +82,7 @@ class SimStudyConfig(StudyConfig):
     """Scenes, sensors, delays and randomisation."""
 
     def load(self) -> Artifact:
-        """The policy with the changed planner.
-
-        Raises:
-            UsageError: an option is invalid.
-            ArtifactError: the policy is missing, damaged, or of another low-level controller.
-        """
-        if self.episodes < 1:
-            raise UsageError(f"--episodes={self.episodes}: expected at least 1")
+        """As `StudyConfig.load`; refuses a policy of another low-level controller."""
         artifact = super().load()
         artifact.require_controller(make_controller(self.env.controller).id)
         return artifact
@@ -106,7 +101,7 @@ class SimStudyConfig(StudyConfig):
 
 def make_main[C: StudyConfig](
     name: str, config: type[C], measure: Callable[[C], None]
-) -> Callable[[Sequence[str] | None], int]:
+) -> Callable[..., int]:
     """The `main` of a study's module, which returns the exit code."""
 
     def main(argv: Sequence[str] | None = None) -> int:

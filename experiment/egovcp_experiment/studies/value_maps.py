@@ -7,7 +7,6 @@ worst) and the height between its best point and the ball's aim are averaged.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -131,8 +130,7 @@ def _shown(maps: list[_Map], aims: Aims) -> dict[str, Any]:
     }
 
 
-CONFIG = ValueMapsConfig
-main = study.make_main("value_maps", CONFIG, measure)
+main = study.make_main("value_maps", ValueMapsConfig, measure)
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    raise SystemExit(main())

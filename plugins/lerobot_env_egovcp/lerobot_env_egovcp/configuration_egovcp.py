@@ -13,9 +13,10 @@ from lerobot.processor import InfoProcessorStep, PolicyProcessorPipeline
 
 from egovcp import spec
 from egovcp.bounds import check_cores
-from egovcp.errors import UsageError, suggest
+from egovcp.errors import UsageError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig as SimulationConfig
+from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task
 from lerobot_env_egovcp.environment_egovcp import LeRobotEgovcpEnv
 
 
@@ -56,17 +57,16 @@ class ControllerIdProcessorStep(InfoProcessorStep):  # type: ignore[misc]
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Unchanged."""
         return features
 
 
 @EnvConfig.register_subclass("egovcp")
 @dataclass
 class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
-    """One of the three tasks with its scene, sensors and randomisation."""
+    """A task with its scene, sensors and randomisation."""
 
-    task: str | None = "ball"
-    """ball, wall or arch."""
+    task: str | None = DEFAULT_TASK
+    """One of `egovcp-task list`, such as ball."""
     fps: int = spec.PLANNER_HZ
     """Planner ticks per second; fixed."""
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -77,14 +77,12 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     """LeRobot's names of the features."""
 
     def __post_init__(self) -> None:
-        if self.task not in spec.TASKS:
-            raise UsageError(f"no task {self.task!r}{suggest(str(self.task), spec.TASKS)}")
+        find_task(str(self.task), "--env.task")
         if self.fps != spec.PLANNER_HZ:
             raise UsageError(f"--env.fps={self.fps}; the planner runs at {spec.PLANNER_HZ} Hz")
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `LeRobotEgovcpEnv`."""
         return {"task": self.task, "config": self.simulation}
 
     def create_envs(
@@ -102,10 +100,6 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
         return {self.type: {0: envs}}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Pre- and postprocessors of these environments.
-
-        Raises:
-            UsageError, ArtifactError: see `make_controller`; for ``simulation.controller``.
-        """
+        """Pre- and postprocessors of these environments."""
         step = ControllerIdProcessorStep(make_controller(self.simulation.controller).id)
         return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])

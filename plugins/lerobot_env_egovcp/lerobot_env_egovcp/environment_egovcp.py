@@ -66,7 +66,6 @@ class LeRobotEgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
         return np.stack([grey] * 3, -1)
 
     def close(self) -> None:
-        """End the threads of the simulation."""
         self._env.close()
 
     def _renamed(self, observed: GymObservation) -> GymObservation:

@@ -14,16 +14,28 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
+from egovcp.data.privileged import mirror_privileged, privileged_features
 from egovcp.data.source import read_source
 from egovcp.errors import DataError
 from egovcp.model import Batch
 
-_COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
-_IMAGE: Final = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+_COLUMNS = (
+    *(spec.REWARD_KEY, spec.REWARD_TERMS_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY),
+    spec.OBJECT_KEY,
+)
+_SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
+    spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
+    spec.STATE_KEY: (spec.STATE_DIM,),
+}
 _CHANNEL_LAST: Final = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
-_INTEGERS: Final = (torch.uint16, torch.int16, torch.int32, torch.uint32, torch.int64)
-_FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-_SHAPES: Final = {spec.DEPTH_KEY: _IMAGE, spec.STATE_KEY: (spec.STATE_DIM,)}
+_NUMBERS: Final = (
+    *(torch.uint16, torch.int16, torch.int32, torch.uint32, torch.int64),
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+)
+_EXPECTED: Final = {
+    spec.DEPTH_KEY: "millimetres as uint16, int32 or float32",
+    spec.STATE_KEY: "numbers, such as float32",
+}
 
 
 def read_observation(
@@ -35,14 +47,8 @@ def read_observation(
         batch: ``observation.images.ego_depth`` (E, 1, 48, 64) or (E, 48, 64, 1), in millimetres
             of any integer or float type but uint8, and ``observation.state`` (E, 74). Without E
             it is the observation of one robot, as `LeRobotDataset` returns it.
-
-    Raises:
-        DataError: one is missing, or of another type, shape or unit.
     """
-    depth, state = (_tensor(batch, key) for key in (spec.DEPTH_KEY, spec.STATE_KEY))
-    if tuple(depth.shape[-3:]) == _CHANNEL_LAST:
-        depth = depth.movedim(-1, -3)
-    depth, state = _batched(depth, spec.DEPTH_KEY), _batched(state, spec.STATE_KEY)
+    depth, state = _part(batch, spec.DEPTH_KEY), _part(batch, spec.STATE_KEY)
     if len(depth) != len(state) or len(state) == 0:
         raise DataError(
             f"{spec.DEPTH_KEY} is of {len(depth)} robots and {spec.STATE_KEY} of {len(state)}; "
@@ -57,18 +63,12 @@ def read_observation(
 def to_millimetres(depth: Tensor) -> Tensor:
     """LeRobot's depth (..., 1, 48, 64), millimetres -> (..., 48, 64) whole ones, int32.
 
-    Negative and non-finite values become 0, invalid.
-
-    Raises:
-        DataError: another type or shape, or not in millimetres.
+    Negative and non-finite values become 0, invalid. Raises `DataError` for another type or shape,
+    or another unit.
     """
-    if depth.dtype not in (*_INTEGERS, *_FLOATS):
-        raise DataError(
-            f"{spec.DEPTH_KEY} has type {_name(depth)}; expected millimetres as uint16, int32 or "
-            "float32"
-        )
-    if tuple(depth.shape[-3:]) != _IMAGE:
-        raise _wrong_shape(spec.DEPTH_KEY, depth, f"(..., {_listed(_IMAGE)})")
+    _require_type(spec.DEPTH_KEY, depth)
+    if tuple(depth.shape[-3:]) != _SHAPES[spec.DEPTH_KEY]:
+        raise _wrong_shape(spec.DEPTH_KEY, depth, "(..., {})")
     # torch has no arithmetic for uint16
     finite = depth.squeeze(-3).float().nan_to_num(0.0, 0.0, 0.0)
     farthest = float(finite.max()) if finite.numel() else 0.0
@@ -80,7 +80,8 @@ def to_millimetres(depth: Tensor) -> Tensor:
     return finite.round().clamp(0, torch.iinfo(torch.uint16).max).to(torch.int32)
 
 
-def _tensor(batch: Mapping[str, Any], key: str) -> Tensor:
+def _part(batch: Mapping[str, Any], key: str) -> Tensor:
+    """The depth (E, 1, 48, 64) or the state (E, 74) of E robots."""
     if key not in batch:
         given = ", ".join(sorted(name for name in batch if name.startswith("observation")))
         raise DataError(
@@ -92,31 +93,25 @@ def _tensor(batch: Mapping[str, Any], key: str) -> Tensor:
         raise DataError(
             f"{key} is a {type(value).__name__}; expected a torch.Tensor (torch.from_numpy)"
         )
-    if key == spec.STATE_KEY and value.dtype not in (*_INTEGERS, *_FLOATS):
-        raise DataError(f"{key} has type {_name(value)}; expected numbers, such as float32")
-    return value
-
-
-def _batched(value: Tensor, key: str) -> Tensor:
-    """``value`` with the leading dimension E of the robots."""
+    _require_type(key, value)
+    if tuple(value.shape[-3:]) == _CHANNEL_LAST:
+        value = value.movedim(-1, -3)
     shape = _SHAPES[key]
     missing = len(shape) + 1 - value.ndim
     if tuple(value.shape[-len(shape) :]) != shape or missing not in (0, 1):
-        expected = f"(E, {_listed(shape)}) for E robots, or ({_listed(shape)}) for one"
-        raise _wrong_shape(key, value, expected)
+        raise _wrong_shape(key, value, "(E, {0}) for E robots, or ({0}) for one")
     return value[None] if missing else value
 
 
+def _require_type(key: str, value: Tensor) -> None:
+    if value.dtype not in _NUMBERS:
+        name = str(value.dtype).removeprefix("torch.")
+        raise DataError(f"{key} has type {name}; expected {_EXPECTED[key]}")
+
+
 def _wrong_shape(key: str, value: Tensor, expected: str) -> DataError:
-    return DataError(f"{key} has shape {tuple(value.shape)}; expected {expected}")
-
-
-def _listed(shape: tuple[int, ...]) -> str:
-    return ", ".join(map(str, shape))
-
-
-def _name(value: Tensor) -> str:
-    return str(value.dtype).removeprefix("torch.")
+    shape = expected.format(", ".join(map(str, _SHAPES[key])))
+    return DataError(f"{key} has shape {tuple(value.shape)}; expected {shape}")
 
 
 @dataclass(frozen=True)
@@ -130,15 +125,12 @@ class RowTargets:
     mc_return: Tensor  # (N,)
     mc_valid: Tensor  # (N,) bool
     terminal_next: Tensor  # (N,) bool
-    reward: Tensor  # (N,)
+    reward: Tensor  # (N,) see `ReturnConfig.target_reward`
+    privileged: Tensor  # (N, F) see `egovcp.data.privileged`
 
     @classmethod
     def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
-        """Compute the targets of a dataset.
-
-        Raises:
-            DataError: the dataset is damaged, or its episodes are too short for any return.
-        """
+        """The targets of a dataset; raises `DataError` if no return is complete."""
         parts = [_episode_targets(reader, i, config) for i in range(len(reader))]
         found = cls(*(torch.from_numpy(np.concatenate(c)) for c in zip(*parts, strict=True)))
         if not found.mc_valid.any():
@@ -166,25 +158,23 @@ class RowTargets:
 
 def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) -> tuple[Any, ...]:
     columns = reader.read_episode_columns(index, _COLUMNS)
-    reward, done, truncated = (columns[name] for name in _COLUMNS)
-    if not np.isfinite(reward).all():
+    reward, terms, done, truncated, position = (columns[name] for name in _COLUMNS)
+    if not (np.isfinite(reward).all() and np.isfinite(terms).all()):
         raise DataError.at(reader.data_path(index), "a reward is not a number", index)
+    reward = config.target_reward(reward, terms)
     limit = reader.time_limit(index)
     return (
         mc_return(reward, config.gamma, config.steps),
         mc_valid(len(reward), limit, config.steps, config.keep_truncated),
         is_terminal(done, truncated),
         reward,
+        privileged_features(position, terms),
     )
 
 
 def open_reader(root: Path, repo_id: str) -> DatasetReader:
-    """A reader of the dataset that LeRobot has loaded from ``root``.
-
-    Raises:
-        DataError: it was not written by egovcp, or is damaged.
-    """
-    return DatasetReader(read_source(Path(root), repo_id))
+    """A reader of the dataset that LeRobot has loaded from ``root``."""
+    return DatasetReader(read_source(root, repo_id))
 
 
 def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:
@@ -193,9 +183,6 @@ def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:
     Args:
         batch: observations (B, T, ...) of rows t .. t + T - 1 and actions (B, T + 1, 7) from
             row t - 1 on, with LeRobot's ``_is_pad`` masks and the ``index`` (B,) of row t.
-
-    Raises:
-        DataError: the depth is not in millimetres, or of another shape.
     """
     state, action = batch[spec.STATE_KEY], batch[spec.ACTION_KEY]
     valid = ~batch[f"{spec.STATE_KEY}_is_pad"]
@@ -213,6 +200,7 @@ def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:
         mc_valid=rows["mc_valid"] & valid,
         terminal_next=rows["terminal_next"] & valid,
         reward=rows["reward"],
+        privileged=rows["privileged"],
     )
 
 
@@ -224,8 +212,10 @@ def mirrored(rows: Batch, which: Tensor) -> Batch:
         other = other * torch.from_numpy(sign).to(value)
         return torch.where(which[:, None, None], other, value)
 
+    signs = mirror_privileged(np.ones(rows.privileged.shape[-1], np.float32))
     return rows._replace(
         depth=torch.where(which[:, None, None, None], rows.depth.flip(-1), rows.depth),
+        privileged=swap(rows.privileged, np.arange(len(signs)), signs),
         state=swap(rows.state, mirror.STATE_SOURCE, mirror.STATE_SIGN),
         action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
         prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),

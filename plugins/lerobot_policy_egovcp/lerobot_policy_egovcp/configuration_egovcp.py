@@ -111,7 +111,6 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
         return
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """AdamW as in ``egovcp-train``."""
         return AdamWConfig(
             lr=self.optimizer_lr,
             weight_decay=self.optimizer_weight_decay,
@@ -119,7 +118,6 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
         )
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        """Linear warm-up, then cosine decay to a tenth of the peak."""
         return CosineDecayWithWarmupSchedulerConfig(
             num_warmup_steps=self.scheduler_warmup_steps,
             num_decay_steps=self.scheduler_decay_steps,

@@ -21,7 +21,7 @@ from egovcp import spec
 from egovcp.artifact import CONFIG, Artifact, load_artifact, write_artifact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.manifest import SEAL
+from egovcp.manifest import FORMAT_KEYS
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.plan import Policy
 from lerobot_policy_egovcp.batches import (
@@ -37,7 +37,6 @@ type Stats = Mapping[str, Mapping[str, Any]]
 
 _LOG: Final = logging.getLogger(__name__)
 _PREFIX = "world_model."
-_OWN_KEYS = ("schema_version", "egovcp_version", "features", "files", SEAL)  # of the manifest
 
 
 class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -56,19 +55,13 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         dataset_stats: Stats | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> None:
-        """A new policy, with the statistics of the dataset if there is one.
-
-        Args:
-            dataset_stats: LeRobot's statistics of the dataset.
-            dataset_meta: the dataset to train on, written by egovcp.
-
-        Raises:
-            DataError: the dataset is not one of egovcp's, or damaged.
-        """
+        """A new policy, with the statistics of the dataset to train on, if there is one."""
         super().__init__(config)
         config.validate_features()
         self.world_model = WorldModel(config.world_model)
-        self._reader = _reader(dataset_meta)
+        self._reader = (
+            open_reader(Path(dataset_meta.root), dataset_meta.repo_id) if dataset_meta else None
+        )
         self._targets: RowTargets | None = None
         self._provenance = _provenance(self._reader)
         self._planner: Policy | None = None
@@ -98,16 +91,13 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Args:
             config: replaces the artifact's own, for another planner or other loss weights.
             dataset_stats: unused; the artifact has its own.
-            dataset_meta: a dataset to train on further.
-
-        Raises:
-            ArtifactError: missing, tampered with, of another spec, not of this ``config``, or
-                of another low-level controller than the dataset.
-            EnvironmentFailure: the Hub cannot be reached.
+            dataset_meta: a dataset to train on further, with the same low-level controller.
         """
         artifact = load_artifact(str(pretrained_name_or_path), revision or "")
         if config is None:
             config = _read_config(artifact.path)
+        if artifact.world_model.object_head is None:  # as egovcp-train saves it
+            config.world_model = config.world_model.without_object()
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
             artifact.require_controller(policy._reader.controller_id)
@@ -126,7 +116,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"{artifact.path}: its weights are not those of --policy.world_model ({reason}); "
                 "leave the sizes as the artifact has them"
             ) from error
-        older = {k: v for k, v in artifact.manifest.items() if k not in _OWN_KEYS}
+        older = {k: v for k, v in artifact.manifest.items() if k not in FORMAT_KEYS}
         self._provenance = self._provenance or older
 
     def reset(self) -> None:
@@ -137,8 +127,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def select_action(self, batch: dict[str, Any]) -> Tensor:
         """Filter one observation of E robots and plan: the action (E, 7) in [-1, 1] to execute.
 
-        The state advances with this action, as if it were sent unchanged. See
-        `predict_action_chunk` for the arguments and the errors.
+        The state advances with this action, as if it were sent unchanged.
         """
         return self.predict_action_chunk(batch)[:, 0]
 
@@ -152,12 +141,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Args:
             batch: the observation, see `read_observation`. ``info`` may hold the
                 ``controller_id`` of the robot's low-level controller, as the processors of
-                ``--env.type=egovcp`` write it.
-
-        Raises:
-            DataError: a part of the observation is missing, or of another type, shape or unit.
-            UsageError: E changed without a `reset`.
-            ArtifactError: the policy is for another low-level controller.
+                ``--env.type=egovcp`` write it; the policy must be for that controller.
         """
         self._require_controller(batch.get("info"))
         depth, state = read_observation(batch)
@@ -195,12 +179,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self._planner
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Loss of the world model on windows (see `to_batch`), and its terms.
-
-        Raises:
-            UsageError: the policy was made without a dataset.
-            DataError: the dataset is damaged.
-        """
+        """Loss of the world model on windows (see `to_batch`), and its terms."""
         rows = to_batch(batch, self._dataset_targets())
         if self.training and self.config.mirror:
             rows = mirrored(rows, torch.rand(len(rows.state), device=rows.state.device) < 0.5)
@@ -208,7 +187,6 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return loss, {name.removeprefix("loss/"): float(value) for name, value in terms.items()}
 
     def get_optim_params(self) -> Iterator[nn.Parameter]:
-        """All parameters, one group."""
         return self.world_model.parameters()
 
     def _dataset_targets(self) -> RowTargets:
@@ -224,11 +202,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
     ) -> None:
-        """Write the artifact; LeRobot adds its processors, and so the manifest is without them.
-
-        Raises:
-            ArtifactError: the low-level controller of the policy is unknown.
-        """
+        """Write the artifact; LeRobot adds its processors, and so the manifest is without them."""
         weights = {
             name.removeprefix(_PREFIX): value
             for name, value in (state_dict or self.state_dict()).items()
@@ -244,10 +218,6 @@ def _read_config(folder: Path) -> EgovcpConfig:
     except (UsageError, DraccusException, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())[:300]
         raise ArtifactError(f"{folder / CONFIG}: {reason}; the file is damaged") from error
-
-
-def _reader(meta: LeRobotDatasetMetadata | None) -> DatasetReader | None:
-    return None if meta is None else open_reader(Path(meta.root), meta.repo_id)
 
 
 def _provenance(reader: DatasetReader | None) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp_deploy.live.external_policy import ExternalPolicyRobot
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
 from egovcp_deploy.live.operators import AutomaticOperator
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -27,22 +27,20 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     """A G1 behind LeRobot's bridge, or egovcp-fake-g1."""
 
     bridge: BridgeConfig = field(default_factory=BridgeConfig)
-    """Where the bridge is."""
+    """Address of the bridge."""
     camera: CameraOptions = field(default_factory=CameraOptions)
     """The depth camera."""
     controller: str = "walk"
     """Low-level controller: walk, stance, or the file of a trained one."""
     limits: Limits = field(default_factory=Limits)
-    """When the robot is held, and when its motors are damped."""
+    """Limits at which the robot holds its pose or its motors are damped."""
     by_itself: bool = False
     """Whether `connect` makes the robot stand up, arm and run, for egovcp-fake-g1. Else use its
     remote control: Y, A, start."""
 
     @property
     def setup(self) -> ControlSetup:
-        """Configuration of the control process."""
-        hardware = HardwareOptions(self.bridge, self.camera)
-        return ControlSetup(hardware, self.controller, self.limits)
+        return ControlSetup(self.bridge, self.camera, self.controller, self.limits)
 
 
 class EgovcpG1(Robot):  # type: ignore[misc]
@@ -68,7 +66,6 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
-        """Hands and height, box units."""
         return dict.fromkeys(spec.ACTION_NAMES, float)
 
     @property
@@ -106,11 +103,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         return {**state, _DEPTH: observation.depth[..., None].copy()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Send `spec.ACTION_NAMES`, each in [-1, 1]; returns the rate-limited action.
-
-        Raises:
-            UsageError: one is missing, or no number.
-        """
+        """Send `spec.ACTION_NAMES`, each in [-1, 1]; returns the rate-limited action."""
         missing = [name for name in spec.ACTION_NAMES if name not in action]
         if missing:
             raise UsageError(f"the action lacks {missing[0]}; expected {spec.ACTION_NAMES}")

@@ -11,6 +11,7 @@ import pytest
 from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
 from tests.support.environments import CountingEnv
+from tests.support.lerobot_datasets import KINDS, write_dataset
 
 type MakeEpisode = Callable[..., Episode]
 
@@ -71,3 +72,10 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     monkeypatch.setattr(socket.socket, "connect", refuse)
+
+
+@pytest.fixture(scope="session")
+def others(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Datasets of many kinds that LeRobot wrote, by kind; tests must not change them."""
+    folder = tmp_path_factory.mktemp("others")
+    return {kind: write_dataset(folder / kind, kind) for kind in KINDS}

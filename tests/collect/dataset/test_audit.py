@@ -36,15 +36,6 @@ def test_collected_episodes_are_reproduced(collected: Path, tmp_path: Path) -> N
     }
 
 
-def test_data_without_a_recorded_guard_cost_are_reproduced(tmp_path: Path) -> None:
-    root = tmp_path / "wall"
-    episode = ["--env.wall_episode.ticks=5", "--env.wall_episode.event_ticks=[3,4]"]
-    flags = [*episode, "--task=wall", "--env.wall.guard_cost=0", "--episodes=1", "--num_workers=1"]
-    assert collect.main([f"--dataset.root={root}", *flags]) == 0
-    d.edit(d.COLLECTION, lambda c: c["config"]["env"]["wall"].pop("guard_cost"))(root)
-    assert main(["audit", str(root)]) == 0
-
-
 def test_a_different_episode_is_reported_with_the_versions(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

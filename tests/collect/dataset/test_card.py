@@ -15,6 +15,7 @@ from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source
 from egovcp.errors import UsageError
 from egovcp.help_text import field_docs
+from egovcp.sim.tasks import task_names
 from egovcp_collect.dataset import card
 from egovcp_collect.dataset.card import CardConfig, card_text
 from egovcp_collect.dataset.card_tables import settings_tables
@@ -49,12 +50,17 @@ def test_front_matter_is_valid(carded: DatasetReader) -> None:
 
 
 def test_the_schema_is_complete(text: str) -> None:
-    for key in schema.FEATURES:
-        assert f"| `{key}` |" in text
+    for key, feature in schema.FEATURES.items():
+        kind = "image, uint16" if feature["dtype"] == "image" else feature["dtype"]
+        shape = spec.FEATURES.get(key, feature)["shape"]
+        shape = (spec.DEPTH_ROWS, spec.DEPTH_COLS) if key == spec.DEPTH_KEY else shape
+        assert f"| `{key}` | {kind} | ({', '.join(map(str, shape))}" in text
     for part in spec.STATE_SLICES.values():
         assert f"| {part.start}:{part.stop} |" in text
-    for name in spec.ACTION_NAMES:
-        assert f"| `{name}` |" in text
+    box = spec.ACTION_BOX
+    for row in zip(spec.ACTION_NAMES, box.low, box.neutral, box.high, strict=True):
+        assert "| `{}` | {:.2f} m | {:.2f} m | {:.2f} m |".format(*row) in text
+    assert f"`observation.state`, {spec.STATE_DIM} values" in text
 
 
 def test_versions_that_read_the_files_are_named(text: str) -> None:
@@ -69,11 +75,11 @@ def test_collection_is_described(text: str) -> None:
     assert SETTINGS.command in text
     assert "mujoco 3.11.0" in text
     assert "stance-1" in text
-    assert "0.32 d with d uniform" in text
+    assert "1.0 d with d uniform" in text
     assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
     assert "`env.ball.block_reward` | 1 | Once" in text
     assert "env.wall." not in text  # no such task in it
-    assert "a step every" not in text
+    assert "a step every 5 to 15 ticks" in text
 
 
 def test_a_walk_with_longer_steps_is_described(tmp_path: Path) -> None:
@@ -85,7 +91,7 @@ def test_a_walk_with_longer_steps_is_described(tmp_path: Path) -> None:
 
 def test_every_setting_of_a_task_is_documented() -> None:
     env = SETTINGS.config["env"]
-    for task in spec.TASKS:
+    for task in task_names(training=True):
         both = "\n".join(settings_tables(SETTINGS.config, [task]))
         for name in (*env[task], *env["camera"], *env["randomise"], *env[f"{task}_episode"]):
             (line,) = {s for s in both.splitlines() if re.search(rf"`env\.\w+\.{name}`", s)} or {""}
@@ -153,7 +159,7 @@ def test_the_linked_template_equals_the_packaged_one() -> None:
     assert (HOUSE / "dataset_cards" / "template.md").read_text() == shipped.read_text()
 
 
-@pytest.mark.parametrize("task", spec.TASKS)
+@pytest.mark.parametrize("task", task_names(training=True))
 def test_the_example_cards_are_valid(task: str) -> None:
     path = HOUSE / "dataset_cards" / f"{task}.md"
     assert DatasetCard.load(path).data.license == "apache-2.0"

@@ -38,6 +38,7 @@ def test_a_sound_dataset_passes(
         "episodes": 6,
         "frames": 57,
         "problems": [],
+        "not_checked": [],
     }
 
 

@@ -1,11 +1,11 @@
-"""The dispatcher: subcommands, positional folders, help and exit codes."""
+"""`egovcp-dataset`: subcommands, positional folders, help and exit codes."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from egovcp_collect.dataset.cli import SUBCOMMANDS, main
+from egovcp_collect.dataset.cli import COMMANDS, main
 
 pytestmark = pytest.mark.usefixtures("no_network")
 
@@ -13,12 +13,12 @@ pytestmark = pytest.mark.usefixtures("no_network")
 def test_help_has_a_line_for_every_subcommand(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    for name, (_, summary) in SUBCOMMANDS.items():
-        assert any(line.split()[:1] == [name] and summary in line for line in lines)
+    for name, entry in COMMANDS.subcommands.items():
+        assert any(line.split()[:1] == [name] and entry.summary in line for line in lines)
     assert main([]) == 2
 
 
-@pytest.mark.parametrize("name", SUBCOMMANDS)
+@pytest.mark.parametrize("name", COMMANDS.subcommands)
 def test_every_subcommand_lists_its_options(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
@@ -32,7 +32,7 @@ def test_every_subcommand_lists_its_options(name: str, capsys: pytest.CaptureFix
     ("args", "message"),
     [
         (["chek"], "did you mean 'check'"),
-        (["check", "a", "b"], "one dataset is expected, found 2: a, b"),
+        (["check", "a", "b"], "unexpected argument 'b'; usage: egovcp-dataset check DATASET"),
         (["check"], "no dataset is named"),
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),

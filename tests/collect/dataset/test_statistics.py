@@ -27,7 +27,7 @@ RETURNS = ReturnConfig(steps=10)
 def reader(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
     """Three balls and, between them, an arch."""
     first, *others = three_balls()
-    arch = scene(3, {5: -0.1}, task="arch", terms=("head",), length=30, time_limit=30)
+    arch = scene(3, {5: -0.1}, task="arch", terms=("hit",), length=30, time_limit=30)
     return write_scenes(tmp_path_factory.mktemp("data") / "mixed", [first, arch, *others])
 
 

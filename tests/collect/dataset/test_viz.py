@@ -81,7 +81,7 @@ def test_the_pelvis_stands_at_its_commanded_height(store: Any) -> None:
 
 def test_events_are_recorded(reader: DatasetReader) -> None:
     ticks = [*ticks_of(reader.read(1))]
-    assert ticks[20].events == ("the ball is thrown",)
+    assert ticks[20].events == ("the event of the task",)
     assert ticks[40].events == ("reward -1.000", "a fall ends the episode")
     assert ticks[40].terminated
     assert not ticks[40].truncated

@@ -383,6 +383,15 @@ def test_the_velocity_is_bounded_and_ramped() -> None:
     np.testing.assert_allclose(last, (VELOCITY_HIGH[0], VELOCITY_LOW[1], VELOCITY_HIGH[2]))
 
 
+def test_a_velocity_outside_the_bounds_is_reported_once() -> None:
+    command = VelocityCommand()
+    assert command.set_target(0, (0.4, 0.0, 0.0)) == ""
+    warning = command.set_target(1, (2.0, 0.0, -0.1))
+    assert "(2, 0, -0.1)" in warning
+    assert "(0.8, 0, -0.1) is commanded" in warning
+    assert command.set_target(2, (2.0, 0.0, 0.0)) == ""
+
+
 def test_silence_for_half_a_second_stops_the_robot() -> None:
     command = VelocityCommand()
     for k in range(50):

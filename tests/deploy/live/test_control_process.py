@@ -24,17 +24,17 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, Phase
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.live.control import ControlLoop
-from egovcp_deploy.live.control_process import ControlProcess, RemoteOperator, merged
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions, open_hardware
+from egovcp_deploy.live.control_process import ControlProcess, merged
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, open_hardware
 from egovcp_deploy.live.link import Link
-from egovcp_deploy.live.operators import AutomaticOperator
+from egovcp_deploy.live.operators import AutomaticOperator, RemoteOperator
 from egovcp_deploy.live.planner_loop import PlannerLoop
 from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
+from egovcp_deploy.robots.fake.command import EpisodeSequencer
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from tests.support.robots.fake_g1 import FakeG1Thread, bridge_config
 from tests.support.robots.sim_low_level import SimLowLevelRobot
@@ -79,14 +79,13 @@ def test_a_recording_says_why_the_robot_was_held_and_damped(
 
 def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
     """From INIT to RUN; then a motor overheats, and once the robot is held another drops out."""
-    options = HardwareOptions(
-        bridge_config(fake), CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
-    )
+    bridge = bridge_config(fake)
+    camera = CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
     address = f"ipc://{folder}/link"
-    setup = ControlSetup(options, "stance", PATIENT, address, os.getppid())
+    setup = ControlSetup(bridge, camera, "stance", PATIENT, address, os.getppid())
     ours, theirs = Link(address, serve=True), Link(address, serve=False)
     stopping: list[int] = []
-    with closing(open_hardware(options)) as hardware, closing(ours), closing(theirs):
+    with closing(open_hardware(bridge, camera)) as hardware, closing(ours), closing(theirs):
         control = ControlProcess(setup, hardware, theirs)
         thread = threading.Thread(target=control.run, args=(stopping,))
         thread.start()
@@ -133,7 +132,7 @@ def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -
     robot.start(Scenario("ball", 0, 0))
     body = SimLowLevelRobot(robot)
     episodes = EpisodeSequencer(
-        body, lambda n: Scenario("ball", 0, n) if n < 3 else None, EpisodeSchedule(pause=pause)
+        body, lambda n: Scenario("ball", 0, n) if n < 3 else None, pause=pause
     )
     clock, controller = LockstepClock(), make_controller(name)
     planner = InlinePlanner(PlannerRunner(Crouching()), clock)
@@ -141,7 +140,10 @@ def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -
     operator, remote = AutomaticOperator(), RemoteOperator()
     seen: set[tuple[Phase, State]] = set()
     for _ in range(2500):
-        commands = [*operator.commands(clock.now_ns(), loop.state), *remote.commands(body)]
+        commands = [
+            *operator.commands(clock.now_ns(), loop.state),
+            *remote.commands(body.read().remote),
+        ]
         loop.tick(clock.now_ns(), OperatorCommand(merged(commands).request))
         seen.add((robot.phase, loop.state))
         for _ in range(4):

@@ -15,33 +15,32 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
-from egovcp_deploy.dry_run import check_message_rate, image_age, joint_offsets, posture
+from egovcp_deploy.dry_run import check_message_rate, check_posture, image_age, joint_offsets
+from egovcp_deploy.robots.base import LowState
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.g1_variants import describe_variant
 from egovcp_deploy.robots.subscriber import ArrivalStats
 from tests.support.robots.fake_g1 import FakeG1Thread
 from tests.support.robots.fault_messages import edited, without_motor_fields
 
 NEUTRAL = standing_pose(ACTION_BOX.neutral[-1]).joints
 KNEE = JOINT_NAMES.index("left_knee_joint")
-PITCH = [JOINT_NAMES.index(f"{side}_ankle_pitch_joint") for side in ("left", "right")]
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def moved(joint: int | list[int], by: float) -> np.ndarray:
+def moved(joint: int, by: float) -> np.ndarray:
     joints = NEUTRAL.copy()
     joints[joint] += by
     return joints
 
 
-def pitched(angle: float) -> np.ndarray:
-    return np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
+def pitched(angle: float) -> LowState:
+    quaternion = np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
+    return LowState(0, NEUTRAL, np.zeros(29), quaternion, np.zeros(3))
 
 
-def test_joints_near_neutral_are_counted_and_the_others_named() -> None:
-    assert joint_offsets(NEUTRAL) == "29 joints within 0.1 rad of neutral"
+def test_the_joint_farthest_from_neutral_is_named() -> None:
+    assert "+0.00 rad from neutral" in joint_offsets(NEUTRAL)
     words = joint_offsets(moved(KNEE, -0.5))
-    assert words == "28 joints within 0.1 rad of neutral; left_knee -0.50"
+    assert words == "the farthest, left_knee_joint is -0.50 rad from neutral"
 
 
 def test_a_joint_far_from_neutral_or_outside_its_range_is_a_no_go() -> None:
@@ -51,25 +50,16 @@ def test_a_joint_far_from_neutral_or_outside_its_range_is_a_no_go() -> None:
         joint_offsets(moved(KNEE, -1.2))
 
 
-def test_a_pelvis_above_flat_feet_agrees_with_the_imu() -> None:
-    words = posture(NEUTRAL, UPRIGHT)
-    assert "0.00 rad from upright, pelvis 0.74 m" in words
-    assert "0.00 (left) and 0.00 rad (right)" in words
-    assert "calibrate" not in words
-
-
-def test_ankles_that_contradict_the_imu_are_pointed_out() -> None:
-    words = posture(moved(PITCH, 0.3), UPRIGHT)
-    assert "0.30 (left) and 0.30 rad (right)" in words
-    assert "hang in the air" in words
-    assert "calibrate" in posture(NEUTRAL, pitched(0.25))
-    leaning = posture(moved(PITCH, -0.25), pitched(0.25))
-    assert "0.00 (left) and 0.00 rad (right)" in leaning, "leans over feet that are flat"
+def test_the_posture_has_tilt_and_height() -> None:
+    assert check_posture(pitched(0.0)) == (
+        "IMU 0.00 rad from upright, pelvis 0.74 m above the lower foot"
+    )
+    assert "0.25 rad from upright" in check_posture(pitched(0.25))
 
 
 def test_a_robot_that_is_not_upright_is_a_no_go() -> None:
     with pytest.raises(EnvironmentFailure, match=r"tilted by 0.50 rad.*hang the robot up upright"):
-        posture(NEUTRAL, pitched(0.5))
+        check_posture(pitched(0.5))
 
 
 @pytest.mark.parametrize(
@@ -98,14 +88,6 @@ def test_the_age_of_images_is_checked_if_the_camera_reports_it() -> None:
         image_age([90.0, 95.0], 80.0)
 
 
-def test_modes_in_words() -> None:
-    assert describe_variant(5) == "mode machine 5: 29 joints, waist free"
-    assert describe_variant(6).startswith(
-        "mode machine 6: 29 joints, waist locked; warning: the waist"
-    )
-    assert "not known" in describe_variant(77)
-
-
 type Look = Callable[..., tuple[int, dict[str, str]]]
 
 
@@ -124,7 +106,7 @@ def look(
     limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MAX_LOST": 0.95, "LISTEN_S": 1.5}
     for name, value in limits.items():
         monkeypatch.setattr(f"egovcp_deploy.dry_run.{name}", value)
-    monkeypatch.setattr("egovcp_deploy.robots.command_conflict.GAP_S", 2.0)
+    monkeypatch.setattr("egovcp_deploy.robots.bridge.GAP_S", 2.0)
 
     def look(change: Callable[[FakeBridge], object], detailed: bool = True) -> Any:
         robot.start(Scenario("ball", 0, 0))

@@ -18,7 +18,6 @@ FULL = MotorReadings(
     torque=COUNT / 3.0,
     temperature=np.stack([30.0 + COUNT, np.where(COUNT == 2, np.nan, 40.0)], axis=1),
     faults=np.where(COUNT == 3, 0x80000000, 0),
-    lost=COUNT,
     enabled=COUNT != 3,
 )
 

@@ -9,6 +9,7 @@ import pytest
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.wall import WallConfig
 from egovcp_deploy.robots.bridge import BridgeRobot
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, bridge_config
@@ -18,7 +19,9 @@ SHORT = EpisodeConfig(ticks=20, event_ticks=(3, 4), empty_probability=0.0)
 
 @pytest.fixture(scope="session")
 def live() -> LiveRobot:
-    return LiveRobot(EnvConfig(controller="stance", ball_episode=SHORT, wall_episode=SHORT))
+    gentle = WallConfig(push_speed_range=(0.3, 0.4))  # the controller does not step
+    config = EnvConfig(controller="stance", ball_episode=SHORT, wall_episode=SHORT, wall=gentle)
+    return LiveRobot(config)
 
 
 @pytest.fixture

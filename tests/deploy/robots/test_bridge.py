@@ -12,7 +12,7 @@ import zmq
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp_deploy.robots.base import MotorCommand
-from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot, mode_refusal, mode_warning
 from egovcp_deploy.robots.fake import FakeBridge
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
@@ -263,6 +263,14 @@ def test_a_locked_waist_is_accepted_if_it_is_named(running: FakeG1Thread) -> Non
     robot.close()
 
 
+def test_modes_that_differ_from_the_controllers_assumptions_give_a_warning() -> None:
+    assert mode_refusal(5, False) == mode_warning(5) == ""
+    assert mode_refusal(77, False) == ""
+    assert "not known" in mode_warning(77)
+    assert "gear is 22.5" in mode_warning(11)
+    assert "waist is locked" in mode_warning(12)
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
@@ -332,18 +340,6 @@ def test_alternating_publishers_are_detected(robot: BridgeRobot, running: FakeG1
 def test_a_constant_publisher_is_detected(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.other_publisher = True
     assert eventually(lambda: "does not follow our commands" in robot.refusal)
-
-
-def test_reported_command_sources_refuse_arming(robot: BridgeRobot, running: FakeG1Thread) -> None:
-    running.fake.faults.report_extra_publisher = True
-
-    def noticed() -> bool:
-        robot.write(DAMP)
-        return "1 other program(s)" in robot.refusal
-
-    assert eventually(noticed)
-    running.fake.faults.report_extra_publisher = False
-    assert eventually(lambda: not robot.refusal)
 
 
 def test_close_may_be_called_twice(robot: BridgeRobot) -> None:

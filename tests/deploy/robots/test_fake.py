@@ -19,10 +19,10 @@ from egovcp_deploy.robots.base import MotorCommand, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
 from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
 from egovcp_deploy.robots.fake.bridge import MODE, WATCHDOG_S
-from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer, outcome_text
+from egovcp_deploy.robots.fake.command import EpisodeSequencer, outcome_text
 from egovcp_deploy.robots.wire import encode_command
 from egovcp_deploy.robots.zmq_camera import decode_frame
-from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, bridge_config, eventually
+from tests.support.robots.fake_g1 import FakeG1Thread, eventually
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 
@@ -78,8 +78,10 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
     episodes = EpisodeSequencer(
         driver.fake,
         lambda n: scenarios[n] if n < 2 else None,
-        EpisodeSchedule(gantry=0.5, settle=0.5, pause=0.1),
         log.append,
+        gantry=0.5,
+        settle=0.5,
+        pause=0.1,
     )
     heights = []
     while not episodes.finished:
@@ -100,7 +102,7 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
 
 
 def test_the_gantry_waits_for_commands_with_stiffness(fake: FakeBridge) -> None:
-    episodes = EpisodeSequencer(fake, lambda n: Scenario("ball", 0, 0), EpisodeSchedule(gantry=0.0))
+    episodes = EpisodeSequencer(fake, lambda n: Scenario("ball", 0, 0), gantry=0.0)
     for _ in range(100):
         episodes.step()
     assert fake.robot.phase is Phase.HELD
@@ -114,9 +116,7 @@ def test_the_gantry_waits_for_commands_with_stiffness(fake: FakeBridge) -> None:
 
 
 def test_the_gantry_waits_for_release_without_a_schedule(fake: FakeBridge) -> None:
-    episodes = EpisodeSequencer(
-        fake, lambda n: Scenario("ball", 0, 0), EpisodeSchedule(gantry=None)
-    )
+    episodes = EpisodeSequencer(fake, lambda n: Scenario("ball", 0, 0), gantry=None)
     send(fake, MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
     for _ in range(20):
         episodes.step()
@@ -175,7 +175,7 @@ def test_ignored_commands_are_not_counted(robot: BridgeRobot, running: FakeG1Thr
 
 def test_a_push_makes_the_robot_fall(driver: LockstepDriver) -> None:
     episodes = EpisodeSequencer(
-        driver.fake, lambda n: Scenario("ball", 2, n), EpisodeSchedule(gantry=0.2, settle=100.0)
+        driver.fake, lambda n: Scenario("ball", 2, n), gantry=0.2, settle=100.0
     )
     while driver.fake.robot.phase is Phase.HELD:
         driver.tick(episodes)
@@ -222,28 +222,6 @@ def test_a_used_port_is_refused(fake: FakeBridge, live: LiveRobot) -> None:
     taken = Ports(command_port=fake.ports.command_port, state_port=0, camera_port=0)
     with pytest.raises(EnvironmentFailure, match="another egovcp-fake-g1"):
         FakeBridge(live, taken)
-
-
-def test_command_sources_are_counted(live: LiveRobot) -> None:
-    live.start(Scenario("ball", 0, 0))
-    ports = Ports(command_port=0, state_port=0, camera_port=0)
-    fake = FakeBridge(live, ports, announce=True)
-    running = FakeG1Thread(fake)
-    one, two = BridgeRobot(bridge_config(fake)), BridgeRobot(bridge_config(fake))
-    try:
-        for robot in (one, two):
-            robot.connect(TIMEOUT_S)
-        damp = MotorCommand(np.zeros(29), np.zeros(29), DAMPING, MODE)
-
-        def noticed() -> bool:
-            one.write(damp)
-            two.write(damp)
-            return "1 other program(s)" in one.refusal
-
-        assert eventually(noticed)
-    finally:
-        for part in (one, two, running, fake):
-            part.stop() if isinstance(part, FakeG1Thread) else part.close()
 
 
 def test_console_commands_set_and_clear_faults() -> None:

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.artifact import load_artifact
-from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import DataError, UsageError
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
@@ -21,10 +20,8 @@ from egovcp.log.tick import RunInfo, Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
-from egovcp.testing import random_episode
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
-from egovcp_deploy.robots import LockstepRobot
-from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings, recorded_run
+from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.rollouts import LockstepRunner
 from tests.support.sinks import MemorySink
@@ -66,7 +63,7 @@ def watched(artifact_dir: Path, askew: float = 0.0) -> Watched:
     return Watched(load_artifact(str(artifact_dir)).make_policy(1, seed=5), askew)
 
 
-def run(policy: Watched, robot: LockstepRobot, sink: Sink) -> None:
+def run(policy: Watched, robot: SimRobot | ReplayRobot, sink: Sink) -> None:
     clock = LockstepClock()
     LockstepRunner(InlinePlanner(PlannerRunner(policy), clock), robot, clock).run(sink)
 
@@ -140,31 +137,6 @@ def test_replay_returns_everything_recorded(
     live.close()
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("data") / "two"
-    with DatasetWriter(root, Provenance("stance-1", seed=0, command="collect")) as writer:
-        writer.add(random_episode(0, 6))
-        writer.add(random_episode(1, 4, time_limit=9))
-    return root
-
-
-def test_replay_of_a_dataset_episode(dataset: Path, artifact_dir: Path) -> None:
-    robot = open_recordings(dataset)
-    assert robot.count == 2
-    assert robot.controller_id == "stance-1"
-    for number, episode in enumerate((random_episode(0, 6), random_episode(1, 4, time_limit=9))):
-        ticks = play(watched(artifact_dir), robot, number)
-        for t, tick in enumerate(ticks):
-            np.testing.assert_array_equal(tick.depth, episode.depth[t])
-            np.testing.assert_array_equal(tick.state, episode.state[t])
-            np.testing.assert_array_equal(tick.action_sent, episode.action[t])
-            assert tick.reward == episode.reward[t]
-        assert ticks[-1].terminated is (number == 1)
-        assert ticks[-1].truncated is (number == 0)
-        assert len(ticks) == len(episode)
-
-
 def test_a_live_run_begins_with_the_first_tick_in_run(
     recorded: tuple[Path, list[Watched]], tmp_path: Path
 ) -> None:
@@ -178,9 +150,10 @@ def test_a_live_run_begins_with_the_first_tick_in_run(
     for tick in (*standing, *running):
         sink.write(tick)
     sink.close()
-    run = recorded_run(tmp_path / "live.mcap")
-    assert len(run) == TICKS
-    np.testing.assert_array_equal(run.observations[0].state, ticks[0].state)
+    robot = open_recordings(tmp_path / "live.mcap")
+    np.testing.assert_array_equal(robot.observe().state, ticks[0].state)
+    ended = [robot.act(np.zeros(7)).truncated for _ in range(TICKS)]
+    assert ended == [False] * (TICKS - 1) + [True]
 
 
 def test_a_torn_recording_ends_truncated(
@@ -198,10 +171,17 @@ def test_a_torn_recording_ends_truncated(
 def test_missing_recordings_are_reported(
     recorded: tuple[Path, list[Watched]], tmp_path: Path
 ) -> None:
-    with pytest.raises(UsageError, match="no recording, folder of recordings"):
+    with pytest.raises(UsageError, match="no recording, or folder of recordings"):
         open_recordings(tmp_path)
     with pytest.raises(UsageError, match="there are 2 recordings"):
         open_recordings(recorded[0]).start(2)
     (tmp_path / "empty.mcap").write_bytes(b"")
     with pytest.raises(DataError):
         open_recordings(tmp_path / "empty.mcap")
+
+
+def test_a_dataset_is_refused_with_the_command_that_converts_it(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(UsageError, match="egovcp-mcap from-dataset"):
+        open_recordings(tmp_path)

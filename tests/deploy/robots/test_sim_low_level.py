@@ -10,7 +10,7 @@ from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX
 from egovcp_deploy.robots.base import MotorCommand, proprioception
-from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
+from egovcp_deploy.robots.fake.command import EpisodeSequencer
 from tests.support.robots.sim_low_level import SimClock, SimLowLevelRobot
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
@@ -23,7 +23,9 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     episodes = EpisodeSequencer(
         robot,
         lambda n: Scenario("ball", 4, 0) if n == 0 else None,
-        EpisodeSchedule(gantry=0.3, settle=0.3, pause=0.0),
+        gantry=0.3,
+        settle=0.3,
+        pause=0.0,
     )
     clock = SimClock(episodes.step)
     rate = FixedRate(50, clock)

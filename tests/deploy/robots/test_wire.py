@@ -39,7 +39,6 @@ FULL = MotorReadings(
     torque=INDEX / 2.0,
     temperature=np.stack([30.0 + INDEX, 40.0 + INDEX], axis=1),
     faults=np.where(INDEX == 3, 0x80000000, 0),
-    lost=INDEX,
     enabled=INDEX != 3,
 )
 
@@ -49,7 +48,7 @@ def command(**changes: Any) -> MotorCommand:
     return MotorCommand(**(fields | changes))
 
 
-def reading(sources: int | None = None) -> LowState:
+def reading() -> LowState:
     quaternion = np.array([0.9, 0.1, -0.3, 0.2])
     return LowState(
         time_ns=7,
@@ -60,7 +59,6 @@ def reading(sources: int | None = None) -> LowState:
         mode=5,
         remote=RemoteControl(ly=0.5).to_bytes(),
         motors=MotorReadings(COUNT * 2),
-        command_sources=sources,
     )
 
 
@@ -143,7 +141,7 @@ def test_we_read_what_lerobots_bridge_sends(server: Any) -> None:
     np.testing.assert_array_equal(got.joint_velocity, -COUNT)
     np.testing.assert_array_equal(got.motors.torque, 2 * COUNT)
     np.testing.assert_array_equal(got.angular_velocity, [1, 2, 3])
-    assert (got.mode, got.time_ns, got.command_sources) == (5, 11, None)
+    assert (got.mode, got.time_ns) == (5, 11)
     assert RemoteControl.parse(got.remote) == RemoteControl(lx=0.25)
 
 
@@ -160,16 +158,14 @@ def test_lerobots_client_reads_our_states() -> None:
     assert message.mode_machine == 5
 
 
-@pytest.mark.parametrize("sources", [None, 2])
-def test_state_round_trip(sources: int | None) -> None:
-    state = reading(sources)
+def test_state_round_trip() -> None:
+    state = reading()
     back = decode_state(encode_state(state, GRAVITY), 7)
     for name in ("joint_position", "joint_velocity", "angular_velocity"):
         np.testing.assert_array_equal(getattr(back, name), getattr(state, name))
     np.testing.assert_allclose(back.quaternion_w, state.quaternion_w, rtol=1e-12)
     np.testing.assert_array_equal(back.motors.torque, state.motors.torque)
     assert (back.mode, back.remote) == (5, state.remote)
-    assert back.command_sources == sources
 
 
 def test_command_round_trip() -> None:
@@ -229,7 +225,6 @@ Q3 = ("data", "motor_state", 3, "q")
         (("data", "wireless_remote"), 3),
         (("data", "mode_machine"), -1),
         (("data", "mode_machine"), 5.0),
-        (("data", "command_sources"), "two"),
     ],
 )
 def test_an_invalid_state_is_malformed(path: tuple[Any, ...], value: Any) -> None:
@@ -249,7 +244,7 @@ def test_invalid_bytes_are_malformed(payload: bytes) -> None:
 
 def test_mutated_messages_are_decoded_or_malformed() -> None:
     rng = np.random.default_rng(0)
-    payloads = (encode_state(reading(2), GRAVITY), encode_command(command()))
+    payloads = (encode_state(reading(), GRAVITY), encode_command(command()))
     for _ in range(2000):
         for original, decode in zip(
             payloads, (lambda raw: decode_state(raw, 0), decode_command), strict=True
@@ -315,14 +310,14 @@ def with_motors(change: Callable[[dict[str, Any]], object]) -> MotorReadings:
 
 def test_optional_motor_fields_round_trip() -> None:
     back = read_motors(state_message())
-    for name in ("torque", "temperature", "faults", "lost", "enabled"):
+    for name in ("torque", "temperature", "faults", "enabled"):
         np.testing.assert_array_equal(getattr(back, name), getattr(FULL, name))
 
 
 def test_motor_field_names_are_those_of_unitree() -> None:
     motor = json.loads(state_message())["data"]["motor_state"][3]
     assert motor["temperature"] == [33.0, 43.0]
-    assert (motor["motorstate"], motor["lost"], motor["mode"]) == (0x80000000, 3, 0)
+    assert (motor["motorstate"], motor["mode"]) == (0x80000000, 0)
 
 
 def test_one_temperature_per_motor_is_accepted() -> None:
@@ -335,25 +330,21 @@ def test_one_temperature_per_motor_is_accepted() -> None:
     [
         ("temperature", "temperature"),
         ("motorstate", "faults"),
-        ("lost", "lost"),
         ("mode", "enabled"),
     ],
 )
 def test_an_absent_motor_field_is_none(name: str, field: str) -> None:
     back = with_motors(lambda motor: motor.pop(name, None))
-    fields = {"temperature", "faults", "lost", "enabled"}
+    fields = {"temperature", "faults", "enabled"}
     assert getattr(back, field) is None
     assert all(getattr(back, other) is not None for other in fields - {field})
 
 
 @pytest.mark.parametrize("value", ["hot", None, [], [1, 2, 3], {}, True, 1e300, -1, 1.5])
 def test_an_invalid_optional_field_keeps_the_reading(value: object) -> None:
-    back = with_motors(
-        lambda motor: motor.update(temperature=value, motorstate=value, lost=value, mode=value)
-    )
+    back = with_motors(lambda motor: motor.update(temperature=value, motorstate=value, mode=value))
     np.testing.assert_array_equal(back.torque, FULL.torque)
     assert back.faults is None
-    assert back.lost is None
     assert back.enabled is None
 
 

@@ -152,7 +152,7 @@ def _commit_rest(root: Path, episodes: list[Episode]) -> None:
         committer.commit()
 
 
-@pytest.mark.parametrize("part", range(20))
+@pytest.mark.parametrize("part", range(8))
 def test_a_full_disk_loses_no_episode(
     tmp_path: Path,
     episodes: list[Episode],
@@ -164,7 +164,7 @@ def test_a_full_disk_loses_no_episode(
     root = tmp_path / "d"
     _commit_all(root, episodes, [3])
     needed = sum(len(v) for k, v in whole[5].items() if whole[3].get(k) != v)
-    room = needed * part // 20
+    room = needed * part // 8
     _commit_with(make_disk(room=room), root, episodes, monkeypatch)
     assert _tree(root) == whole[3]
     assert not (work_folder(root) / "next").exists()  # what did not fit has been removed

@@ -1,7 +1,7 @@
 import numpy as np
 
 from egovcp import spec
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.data.mirror import mirror_action, mirror_depth, mirror_position, mirror_state
 from egovcp.robot.kinematics import palm_positions
 
 
@@ -21,6 +21,12 @@ def test_mirroring_twice_is_the_identity() -> None:
     np.testing.assert_array_equal(mirror_state(mirror_state(state)), state)
     np.testing.assert_array_equal(mirror_action(mirror_action(action)), action)
     assert mirror_state(state).dtype == np.float32
+
+
+def test_mirroring_a_position_changes_the_side() -> None:
+    position = np.array([[2.0, 0.3, 0.1], [1.0, -0.2, 0.5]], dtype=np.float32)
+    np.testing.assert_array_equal(mirror_position(position), position * [1, -1, 1])
+    assert mirror_position(position).dtype == np.float32
 
 
 def test_mirroring_an_action_mirrors_the_hand_targets() -> None:

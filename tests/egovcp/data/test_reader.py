@@ -1,17 +1,30 @@
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from egovcp import spec
-from egovcp.data import DatasetConfig, DatasetReader, Episode, load_arrays, open_dataset
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    Provenance,
+    load_arrays,
+    metadata,
+    open_dataset,
+)
+from egovcp.data.committer import load_append_state
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.errors import DataError, UsageError
+from egovcp.testing import random_episode
+from tests.support.earlier import without_optional_columns
 
 _DATA = "data/chunk-000/file-000.parquet"
 
@@ -205,3 +218,40 @@ def test_unknown_columns_and_folders_are_data_errors(dataset_root: Path) -> None
         load_arrays(dataset_root, ["actions"])
     with pytest.raises(DataError, match=r"no such folder: .*nowhere/at/all"):
         open_dataset("nowhere/at/all")
+
+
+def test_a_dataset_of_an_earlier_version_has_zeros(copy: Path, episodes: list[Episode]) -> None:
+    absent = list(spec.OPTIONAL_KEYS)
+    without_optional_columns(copy)
+    reader = DatasetReader.open(DatasetConfig(root=str(copy)))
+    assert not set(absent) & set(reader.features)
+    columns = reader.read_columns([*absent, spec.REWARD_KEY])
+    assert not any(columns[key].any() for key in absent)
+    np.testing.assert_array_equal(
+        columns[spec.REWARD_KEY], np.concatenate([e.reward for e in episodes])
+    )
+    assert not reader.to_episode(
+        0, reader.read_episode_columns(0, [*EPISODE_FEATURES.values()])
+    ).object.any()
+    with pytest.raises(DataError, match="was written by an earlier version"):
+        load_append_state(copy)
+
+
+def test_a_dataset_that_is_replaced_while_it_is_opened_is_opened_again(
+    copy: Path, tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = tmp_path / "longer"
+    with DatasetWriter(longer, Provenance("stance-1", seed=0, command="collect")) as writer:
+        for episode in [*episodes, random_episode(6)]:
+            writer.add(episode)
+    load = metadata.load_episode_table
+
+    def load_and_replace(root: Path, info: Mapping[str, Any]) -> metadata.EpisodeTable:
+        table = load(root, info)
+        if longer.exists():
+            shutil.rmtree(copy)
+            longer.rename(copy)
+        return table
+
+    monkeypatch.setattr(metadata, "load_episode_table", load_and_replace)
+    assert len(open_dataset(copy)) == 7

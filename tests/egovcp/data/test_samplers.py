@@ -23,6 +23,7 @@ from egovcp.data import (
 )
 from egovcp.data.index import in_split
 from egovcp.data.mirror import mirror_action, mirror_state
+from egovcp.data.privileged import privileged_features
 from egovcp.data.samplers import PrefetchIterator
 from egovcp.errors import DataError, UsageError
 
@@ -52,6 +53,8 @@ def test_every_row_of_a_window_is_the_row_of_its_episode(
             for name in ("depth", "state", "action", "reward", "success"):
                 rows = getattr(source, name)[t[valid]]
                 np.testing.assert_array_equal(batch[name][b][valid], rows)
+            features = privileged_features(source.object, source.reward_terms)
+            np.testing.assert_array_equal(batch["privileged"][b][valid], features[t[valid]])
             np.testing.assert_array_equal(batch["is_first"][b], (t == 0) & valid)
             fell = source.terminated & (t == len(source) - 1) & valid
             np.testing.assert_array_equal(batch["terminal_next"][b], fell)

@@ -79,7 +79,6 @@ def _motors(index: int, rng: np.random.Generator) -> MotorReadings:
         torque=rng.normal(0, 10, 29),
         temperature=30.0 + rng.uniform(0, 10, (29, 2)),
         faults=faults,
-        lost=np.arange(29) * index,
         enabled=np.arange(29) != 4,
     )
 

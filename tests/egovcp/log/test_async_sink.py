@@ -145,7 +145,7 @@ def test_a_full_disk_is_reported_once(
     for index in range(3, 6):
         sink.write(make_tick(index, bare=True))
     assert isinstance(sink.failure, OSError)
-    assert warnings == ["the log: No space left on device; the run goes on without this log"]
+    assert warnings == ["the log: No space left on device; the run continues without this log"]
     sink.close()
     assert sink.dropped + sink.lost == 4
     assert len(warnings) == 2
@@ -163,7 +163,7 @@ def test_a_killed_writer_is_reported_once(
         time.sleep(0.01)
     sink.write(make_tick(index, bare=True))
     assert warnings == [
-        "the log: its writer process ended by signal 9; the run goes on without this log"
+        "the log: its writer process ended by signal 9; the run continues without this log"
     ]
 
 

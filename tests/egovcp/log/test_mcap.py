@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
-from egovcp.log.messages import Topic
+from egovcp.log.messages import Topic, motor_readings
 from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.robot.kinematics import LINK_NAMES
 
@@ -65,6 +66,17 @@ def test_write_then_read_is_the_identity(tmp_path: Path, make_tick: Any) -> None
     assert len(recording.ticks) == len(ticks)
     for written, read in zip(ticks, recording.ticks, strict=True):
         assert_same(written, read)
+
+
+def test_the_row_of_lost_packets_in_older_recordings_is_ignored() -> None:
+    dims = [SimpleNamespace(label="faults,lost,enabled", size=3), SimpleNamespace(label="", size=2)]
+    status = SimpleNamespace(layout=SimpleNamespace(dim=dims), data=[8.0, 0.0, 5.0, 6.0, 1.0, 0.0])
+    joints = SimpleNamespace(effort=[1.0, 2.0])
+    found = motor_readings({Topic.JOINTS: joints, Topic.MOTOR_STATUS: status})
+    assert found is not None
+    assert found.faults is not None
+    assert found.enabled is not None
+    assert (found.faults.tolist(), found.enabled.tolist()) == ([8, 0], [True, False])
 
 
 def test_files_may_number_their_topics_differently(tmp_path: Path, make_tick: Any) -> None:

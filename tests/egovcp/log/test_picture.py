@@ -1,4 +1,4 @@
-"""The picture of a rollout shows the right moments and survives missing parts."""
+"""Pictures and videos of a rollout show the right moments and survive missing parts."""
 
 from __future__ import annotations
 
@@ -6,23 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.picture import (
     AHEAD,
+    SIZE,
+    STRIDE,
     PictureSink,
     curves,
     depth_rows,
     imagined_of,
     key_frames,
     rollout_picture,
+    video_frames,
 )
-from egovcp.log.sketch import Surface, Viewpoint, paint, scene_surface
+from egovcp.log.scene_plot import scene_faces, view_offset
 from egovcp.log.tick import RunInfo, SceneObject
 
 
@@ -99,78 +101,57 @@ def test_a_picture_is_never_overwritten(tmp_path: Path) -> None:
         PictureSink(tmp_path / "a.png").open(RunInfo("ball"))
 
 
-def test_the_target_projects_to_the_centre() -> None:
-    eye = Viewpoint(position=(-3.0, 0.0, 1.0), target=(0.0, 0.0, 1.0))
-    points, depth = eye.project(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [0.0, 0.0, 1.5]]))
-    np.testing.assert_allclose(points[0], 0.0, atol=1e-12)
-    assert depth[0] == pytest.approx(3.0)
-    assert points[1, 0] < 0
-    assert points[1, 1] == pytest.approx(0.0)
-    assert points[2, 1] > 0
-
-
 @pytest.mark.parametrize("way", [(8.0, 0.0), (0.0, -5.0), (-3.0, 4.0)])
-def test_the_viewpoint_follows_walking_but_not_stumbling(
-    way: tuple[float, float],
-) -> None:
+def test_the_view_follows_walking_but_not_stumbling(way: tuple[float, float]) -> None:
     stumble = np.array(way) / np.hypot(*way) * 0.2
-    assert Viewpoint().following(np.array([*stumble, 0.74])) == Viewpoint()
+    assert view_offset(np.array([*stumble, 0.74])) == (0.0, 0.0)
     for share in (0.2, 0.5, 1.0):
         pelvis = np.array([way[0] * share, way[1] * share, 0.74])
-        eye = Viewpoint().following(pelvis)
-        (points, _) = eye.project(pelvis[None])
-        assert np.all(np.abs(points) < [0.85, 0.5]), "it stays in the picture"
-        moved = np.subtract(eye.target, Viewpoint().target)
-        np.testing.assert_allclose(np.subtract(eye.position, Viewpoint().position), moved)
-        assert moved[2] == 0.0
+        assert np.hypot(*(pelvis[:2] - view_offset(pelvis))) == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("shape", ["sphere", "box"])
 def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
     thing = SceneObject("a", shape, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (0.2, 0.2, 0.2))
-    (surface,) = scene_surface([thing])
-    outward = surface.corners_w.mean(axis=1) - (1.0, 2.0, 3.0)
-    areas = np.linalg.norm(
-        np.cross(
-            surface.corners_w[:, 1] - surface.corners_w[:, 0],
-            surface.corners_w[:, 2] - surface.corners_w[:, 0],
-        ),
-        axis=1,
-    )
-    assert np.all(np.sum(surface.normals * outward, axis=1)[areas > 1e-9] > 0)
-    volume = np.sum(np.linalg.det(surface.corners_w - np.array([1.0, 2.0, 3.0]))) / 6
+    ((corners, _),) = scene_faces([thing])
+    a, b, c, d = (corners - (1.0, 2.0, 3.0)).transpose(1, 0, 2)
+    normals = np.cross(c - a, d - b)
+    assert np.all(np.sum(normals * (a + b + c + d), axis=1) > 0)
+    volume = sum(np.linalg.det(np.stack(half, axis=1)).sum() for half in ((a, b, c), (a, c, d))) / 6
     assert volume == pytest.approx(0.4**3 if shape == "box" else 4.19 * 0.2**3, rel=0.1)
 
 
-def test_nearer_triangles_are_painted_over_farther_ones() -> None:
-    near = np.array([[[0.0, -1, 0], [0.0, 1, 0], [0.0, 0, 1]]])
-    far = near + np.array([1.0, 0.0, 0.0])
-    eye = Viewpoint(position=(-3.0, 0.0, 0.3), target=(0.0, 0.0, 0.3))
-    surfaces = [
-        Surface(near[:, ::-1], np.array([[255.0, 0, 0]])),
-        Surface(far[:, ::-1], np.array([[0, 0, 255.0]])),
-    ]
-    axes = Figure().subplots()
-    paint(axes, surfaces, eye)
-    colours = axes.collections[0].get_facecolor()
-    assert colours[0][2] > colours[0][0], "the far, blue triangle comes first"
-    assert colours[-1][0] > colours[-1][2]
+def test_frames_change_with_the_depth_image(make_tick: Any) -> None:
+    ticks = [make_tick(i, bare=False) for i in range(2 * STRIDE)]
+    first, second = video_frames(ticks)
+    assert first.shape == (SIZE[1], SIZE[0], 3)
+    assert (first != second).any()
+    assert len(np.unique(first)) > 20
 
 
-@pytest.mark.parametrize(("shape", "hides"), [("sphere", True), ("box", False)])
-def test_a_ball_hides_what_is_behind_it_and_a_wall_does_not(shape: Any, hides: bool) -> None:
-    thing = SceneObject("a", shape, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.3, 0.3, 0.3))
-    eye = Viewpoint(position=(-3.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
-    middles = []
-    for behind in ((255.0, 0.0, 0.0), (0.0, 0.0, 255.0)):
-        corners = np.array([[[1.0, 0.9, -0.9], [1.0, -0.9, -0.9], [1.0, 0.0, 0.9]]])
-        figure = Figure(figsize=(1, 1))
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set(xlim=(-1, 1), ylim=(-1, 1))
-        paint(axes, [Surface(corners, np.array([behind])), *scene_surface([thing])], eye)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        picture = np.asarray(canvas.buffer_rgba())
-        middles.append(picture[picture.shape[0] // 2, picture.shape[1] // 2, :3].astype(int))
-    seen = np.abs(middles[0] - middles[1]).max()
-    assert (seen < 30) == hides, "the seams between triangles let a little through"
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_gif_has_one_frame_per_stride(tmp_path: Path, make_tick: Any, bare: bool) -> None:
+    path = tmp_path / "a.gif"
+    sink = PictureSink(path)
+    sink.open(RunInfo("ball"))
+    for i in range(6):
+        sink.write(make_tick(i, bare=bare))
+    sink.close()
+    with Image.open(path) as image:
+        assert image.size == SIZE
+        assert image.info["duration"] == 80
+        assert 1 < image.n_frames <= 3  # type: ignore[attr-defined]
+
+
+def test_an_mp4_has_the_same_frames(tmp_path: Path, make_tick: Any) -> None:
+    path = tmp_path / "a.mp4"
+    sink = PictureSink(path)
+    sink.open(RunInfo("ball"))
+    for i in range(6):
+        sink.write(make_tick(i, bare=False))
+    sink.close()
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height) == SIZE
+        assert float(stream.average_rate or 0) == 12.5
+        assert sum(1 for _ in container.decode(video=0)) == 3

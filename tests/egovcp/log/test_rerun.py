@@ -25,6 +25,12 @@ from egovcp.spec import ACTION_BOX
 INFO = RunInfo(task="ball", seed=1, episode=2)
 
 
+@pytest.fixture(autouse=True)
+def imagined_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ticks of these tests have five imagined images."""
+    monkeypatch.setattr(paths, "IMAGINED_TICKS", (1, 5))
+
+
 def record(path: Path, ticks: Sequence[Tick], **options: Any) -> Any:
     sink = RerunSink(path, **options)
     sink.open(INFO)
@@ -53,7 +59,7 @@ def entities(store: Any) -> set[str]:
 
 def test_every_field_of_a_tick_is_logged(tmp_path: Path, make_tick: Any) -> None:
     ticks = [make_tick(i) for i in range(3)]
-    found = entities(record(tmp_path / "a.rrd", ticks, imagined=(1, 5)))
+    found = entities(record(tmp_path / "a.rrd", ticks))
     fixed = [paths.DEPTH, paths.RECONSTRUCTED, paths.CAMERA, paths.CANDIDATES, paths.BEST]
     named = [f"{paths.ROBOT}/{link}" for link in LINK_NAMES]
     named += [f"{paths.IMAGINED}/{i}" for i in range(2)] + [f"{paths.SCENE}/ball"]
@@ -136,9 +142,9 @@ def test_candidates_are_world_paths_coloured_by_value(tmp_path: Path, make_tick:
 
 
 def test_every_view_of_the_blueprint_has_data(tmp_path: Path, make_tick: Any) -> None:
-    found = entities(record(tmp_path / "a.rrd", [make_tick(i) for i in range(3)], imagined=(1, 5)))
-    origins = [view.origin for view in views(blueprint((1, 5)).root_container)]
-    assert len(origins) == 20
+    found = entities(record(tmp_path / "a.rrd", [make_tick(i) for i in range(3)]))
+    origins = [view.origin for view in views(blueprint().root_container)]
+    assert len(origins) == 19
     for origin in origins:
         assert any(path == origin or path.startswith(f"{origin}/") for path in found), origin
 

@@ -30,7 +30,6 @@ def test_every_curve_has_a_name(make_tick: Any) -> None:
     tick = make_tick(1)
     for signal in SIGNALS:
         assert len(signal.names) == len(set(signal.names)) == len(signal.values(tick))
-        assert signal.colours is None or len(signal.colours) == len(signal.names)
     assert len({signal.path for signal in SIGNALS}) == len(SIGNALS)
 
 

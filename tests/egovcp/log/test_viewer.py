@@ -83,8 +83,8 @@ def test_a_killed_viewer_is_reported_once(web: LiveRerun, make_tick: Any) -> Non
         time.sleep(0.02)
     sink.close()
     assert isinstance(sink.failure, EnvironmentFailure)
-    assert "could not be sent" in warnings[0]
-    assert "the run goes on without this log" in warnings[0]
+    assert "cannot send the recording" in warnings[0]
+    assert "the run continues without this log" in warnings[0]
     assert len(warnings) == 2
 
 

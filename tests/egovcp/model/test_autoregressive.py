@@ -39,7 +39,7 @@ def test_autoregressive_training_replaces_the_kl_terms_and_no_others(batch: Batc
     _, joint = world_model_loss(toy_model(), batch, draw(0))
     _, fed = world_model_loss(_model(), batch, draw(0))
     assert set(joint) - set(fed) == {"loss/kl_prior", "loss/kl_posterior"}
-    added = {"depth", "state"}
+    added = {"depth", "state", "object"}
     assert set(fed) - set(joint) == {f"loss/autoregressive_{name}" for name in added}
     for name in ("depth", "state", "value", "termination", "imagined_value"):
         torch.testing.assert_close(fed[f"loss/{name}"], joint[f"loss/{name}"])

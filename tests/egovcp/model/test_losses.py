@@ -183,7 +183,8 @@ def test_value_is_asked_about_the_action_of_its_own_row() -> None:
     batch, recorder = random_batch(2, 5), _Recorder()
     config = LossConfig(imagined_steps=3)
     value_and_termination_losses(recorder, _counted(batch), batch, config)
-    for k, (carry, action) in enumerate(recorder.values):
+    for k, (states, actions) in enumerate(recorder.values):
+        carry, action = states.map(lambda x: x[:, :, 0]), actions[:, :, 0]
         torch.testing.assert_close(action, batch.action[:, k:])
         start = torch.arange(5.0 - k).expand(2, 5 - k)
         torch.testing.assert_close(carry.h[..., CountingModel.COUNT], start)

@@ -100,7 +100,8 @@ def test_a_model_without_a_reward_head_says_how_to_get_one() -> None:
 def _reward_loss(model: WorldModel, batch: Batch) -> torch.Tensor:
     with torch.no_grad():
         rollout = filter_sequence(model, batch, sample=False)
-    return value_and_termination_losses(model, rollout, batch, model.config.loss)["reward"]
+    losses = value_and_termination_losses(model, rollout, batch, model.config.loss)
+    return losses["reward"]
 
 
 def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:

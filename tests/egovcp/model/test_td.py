@@ -13,7 +13,7 @@ from egovcp.model.value_losses import (
     TargetNetwork,
     td_target,
     value_and_termination_losses,
-    value_target,
+    value_targets,
 )
 from egovcp.testing import random_batch, toy_model
 
@@ -90,12 +90,13 @@ def test_no_target_reaches_into_another_episode_or_comes_from_burn_in() -> None:
 def test_what_q_is_fitted_to_is_one_choice() -> None:
     model, batch = _model(), random_batch(2, 5)
     carry = _states(model, batch)
-    by_td, known = value_target(model, carry, batch)
-    torch.testing.assert_close(by_td, (td_target(model, carry, batch)[0] + 2.0) / 3.0)
+    action, by_td, known = value_targets(model, carry, batch)
+    assert torch.equal(action[:, :, 0], batch.action)
+    torch.testing.assert_close(by_td[..., 0], (td_target(model, carry, batch)[0] + 2.0) / 3.0)
     assert not known[:, -1].any()
     model.config = DEBUG
-    by_mc, known = value_target(model, carry, batch)
-    torch.testing.assert_close(by_mc, (batch.mc_return + 2.0) / 3.0)
+    _, by_mc, known = value_targets(model, carry, batch)
+    torch.testing.assert_close(by_mc[..., 0], (batch.mc_return + 2.0) / 3.0)
     assert torch.equal(known, batch.mc_valid)
 
 
@@ -103,7 +104,8 @@ def test_incomplete_returns_do_not_matter() -> None:
     model, batch = _model(), random_batch(2, 5)
     carry = _states(model, batch)
     none = batch._replace(mc_valid=torch.zeros_like(batch.mc_valid))
-    assert torch.equal(value_target(model, carry, none)[1], value_target(model, carry, batch)[1])
+    found, expected = (value_targets(model, carry, x).usable for x in (none, batch))
+    assert torch.equal(found, expected)
 
 
 def test_no_gradient_goes_through_the_target() -> None:

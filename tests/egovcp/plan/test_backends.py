@@ -109,7 +109,9 @@ def test_plan_values_agree_with_the_reference(
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize("horizon", [1, 2, 7])
-def test_any_horizon(backend: BackendName, tolerance: float, horizon: int) -> None:
+def test_backends_agree_with_the_reference_at_any_horizon(
+    backend: BackendName, tolerance: float, horizon: int
+) -> None:
     model = _model()
     carry, actions = _carry(model), _actions(horizon=horizon)
     rule = PlannerConfig(backend="eager", termination_rule="survival")
@@ -146,7 +148,9 @@ def test_values_of_a_robot_do_not_depend_on_others(backend: BackendName, toleran
 
 @needs_compiler
 @pytest.mark.parametrize("threads", [2, 3])
-def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_threads_does_not_change_values(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model, config = _model(), PlannerConfig(backend="int8")
     carry, actions = _carry(model), _actions()
     monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
@@ -156,7 +160,7 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
 
 
 @needs_compiler
-def test_threads_that_have_left_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_threads_are_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     model, config = _model(), PlannerConfig(backend="int8")
     evaluator, actions = make_evaluator(model, config), _actions()
@@ -169,7 +173,7 @@ def test_threads_that_have_left_come_again(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
-def test_nan_stays_in_its_row(backend: BackendName, tolerance: float) -> None:
+def test_nan_affects_only_its_own_plan(backend: BackendName, tolerance: float) -> None:
     model, config = _model(), PlannerConfig(backend=backend)
     carry, actions = _carry(model), _actions()
     sound = _values(model, config, carry, actions)
@@ -180,6 +184,12 @@ def test_nan_stays_in_its_row(backend: BackendName, tolerance: float) -> None:
     lost[1], lost[2, 5] = True, True
     assert found.isnan().equal(lost)
     torch.testing.assert_close(found[~lost], sound[~lost], rtol=1e-3, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where kernels for other processors are kept, so that each is compiled once."""
+    return tmp_path_factory.mktemp("kernels")
 
 
 @needs_compiler
@@ -202,7 +212,7 @@ def test_the_kernel_agrees_across_vector_widths(
     objective: Any,
     vectors: tuple[str, ...],
     monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
+    kernels: Path,
 ) -> None:
     model = _model(value_loss=kind, loss=LossConfig(reward=1.0))
     config = PlannerConfig(backend="int8", objective=objective)
@@ -210,11 +220,12 @@ def test_the_kernel_agrees_across_vector_widths(
     here = _values(model, config, carry, actions)
     plain = tuple(flag for flag in library.FLAGS if not flag.startswith("-m"))
     monkeypatch.setattr(library, "FLAGS", (*plain, *vectors))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cache = kernels / "-".join(("kernel", *vectors))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     library.library.cache_clear()
     try:
         elsewhere = _values(model, config, carry, actions)
-        assert len(list(tmp_path.rglob("*.so"))) == 1
+        assert len(list(cache.rglob("*.so"))) == 1
     finally:
         library.library.cache_clear()
     error = (here - elsewhere).abs().flatten().sort().values
@@ -226,7 +237,7 @@ def test_the_kernel_agrees_across_vector_widths(
     not library.processor_has("amx_int8") or library.tiles_are_refused(), reason="no AMX"
 )
 @pytest.mark.parametrize("change", MODELS)
-def test_where_tiles_are_refused_vectors_say_exactly_the_same(
+def test_kernel_without_tiles_is_bit_identical(
     change: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, config = _model(**change), PlannerConfig(backend="int8")
@@ -243,7 +254,7 @@ def test_where_tiles_are_refused_vectors_say_exactly_the_same(
 
 
 @needs_compiler
-def test_odd_sizes_are_refused_by_int8_and_left_to_float32_by_auto() -> None:
+def test_unsupported_sizes_are_refused_by_int8_and_planned_in_float32_by_auto() -> None:
     model = _model(units=20)
     with pytest.raises(UsageError, match=r"20 units.*float32"):
         make_evaluator(model, PlannerConfig(backend="int8"))
@@ -251,7 +262,7 @@ def test_odd_sizes_are_refused_by_int8_and_left_to_float32_by_auto() -> None:
 
 
 @needs_compiler
-def test_auto_takes_int8_where_the_processor_is_made_for_it(
+def test_auto_selects_int8_on_fast_processors(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for fast, kind in ((True, Int8Evaluator), (False, FloatEvaluator)):
@@ -259,13 +270,13 @@ def test_auto_takes_int8_where_the_processor_is_made_for_it(
         assert isinstance(make_evaluator(toy_model(), PlannerConfig()), kind)
 
 
-def test_a_model_that_thinks_for_itself_is_asked_step_by_step() -> None:
+def test_subclass_of_the_world_model_is_evaluated_by_the_reference() -> None:
     assert isinstance(make_evaluator(CountingModel(), PlannerConfig()), ReferenceEvaluator)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_the_same_on_a_gpu() -> None:
+def test_gpu_values_agree_with_the_reference() -> None:
     model = _model()
     carry, actions = _carry(model), _actions()
     expected = _values(model, PlannerConfig(backend="eager"), carry, actions)
@@ -292,7 +303,7 @@ def _on_lines(table: Tensor, reach: float, unit: int, a: Tensor) -> Tensor:
     ],
     ids=["silu", "tanh"],
 )
-def test_lines_are_near_their_function(
+def test_activation_tables_approximate_their_functions(
     function: Callable[[Tensor], Tensor], table: Tensor, reach: float, unit: int, allowed: float
 ) -> None:
     a = torch.linspace(0, reach, 10_001, dtype=torch.float64)
@@ -300,7 +311,7 @@ def test_lines_are_near_their_function(
     assert error.max() < allowed
 
 
-def test_bytes_of_hidden_layers_count_from_below_the_least_silu() -> None:
+def test_byte_offset_of_hidden_layers_is_below_the_minimum_of_silu() -> None:
     x = torch.linspace(-3, 0, 10_001)
     assert torch.nn.functional.silu(x).min() > LEAST_SILU
     assert silu_table()[0].min() / UNIT > LEAST_SILU

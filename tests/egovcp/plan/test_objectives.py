@@ -64,7 +64,7 @@ def test_rewards_are_discounted_and_the_value_comes_after_the_last(
     ],
 )
 def test_a_failed_plan_has_the_value_of_failing_forever(rule: str, expected: float) -> None:
-    """It fails at tick 1, whose own reward counts; rewards and value after it do not."""
+    """It fails at step 1, whose own reward counts; rewards and value after it do not."""
     world = _scripted([0.0, 1.0, 0.0, 0.0], 0.5)
     assert _worth(world, 3, objective="td", termination_rule=rule) == pytest.approx(expected)
 
@@ -135,7 +135,7 @@ def test_batched_plan_values_equal_single_ones(objective: Any, horizon: int, rul
                 assert found[e, m].item() == pytest.approx(expected, abs=1e-4)
 
 
-def test_the_loop_has_met_failures_and_survivals() -> None:
+def test_reference_loop_covers_failures_and_survivals() -> None:
     """Else the comparison above would say nothing of the rules."""
     model, actions = _model(), _plans(2, 5, 6)
     with torch.no_grad():

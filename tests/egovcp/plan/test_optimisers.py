@@ -51,7 +51,7 @@ def _worth(executed: Tensor, goal: Tensor, actions: Tensor) -> Tensor:
 
 
 @every
-def test_a_quadratics_optimum_is_found(name: OptimiserName) -> None:
+def test_optimum_of_a_quadratic_is_found(name: OptimiserName) -> None:
     """Better than all but the best of what chance finds; the refining searches come close."""
     executed = _random(4, 0, scale=0.4)
     goal = executed + 0.15
@@ -124,7 +124,7 @@ class _Broken(PointWorld):
 
 
 @every
-def test_plans_without_a_finite_value_never_win(name: OptimiserName) -> None:
+def test_plans_without_a_finite_value_are_never_chosen(name: OptimiserName) -> None:
     plan = _plan(name, torch.zeros(1, 7), torch.full((1, 7), 0.5), world=_Broken())
     assert (plan.actions[..., 0] <= 1e-6).all()
     assert plan.value.isfinite().all()
@@ -145,7 +145,7 @@ def test_without_finite_values_the_plan_continues_and_its_value_is_minus_infinit
 
 
 @pytest.mark.parametrize("name", ["icem", "shooting"])
-def test_searches_that_keep_the_best_never_lose_it(name: OptimiserName) -> None:
+def test_optimisers_that_keep_the_best_plan_never_get_worse(name: OptimiserName) -> None:
     executed, goal = _random(4, 9), _random(4, 10)
     values = [_plan(name, executed, goal, iterations=n).value for n in (1, 2, 4, 8)]
     for before, after in itertools.pairwise(values):
@@ -166,7 +166,7 @@ def test_icem_samples_fewer_each_iteration_and_repeats_elites() -> None:
 
 
 @pytest.mark.parametrize("exponent", [0.0, 2.0])
-def test_coloured_noise_has_unit_variance_and_its_colour(exponent: float) -> None:
+def test_coloured_noise_has_unit_variance_and_the_given_spectrum(exponent: float) -> None:
     rng = torch.Generator().manual_seed(0)
     noise = coloured(torch.zeros(1, 8, 7), 4000, exponent, rng)[0]  # (M, N, 7)
     assert noise.std(0).sub(1).abs().max() < 0.05
@@ -174,7 +174,7 @@ def test_coloured_noise_has_unit_variance_and_its_colour(exponent: float) -> Non
     assert (alike > 0.5) if exponent else (alike.abs() < 0.02)
 
 
-def test_mppi_weighs_by_value_whatever_the_unit() -> None:
+def test_mppi_weights_do_not_depend_on_the_unit_of_values() -> None:
     values = torch.tensor([[1.0, 2.0, 3.0, -math.inf], [-math.inf] * 4])
     one, thousand = weights(values, 0.5), weights(1000 * values, 0.5)
     torch.testing.assert_close(one, thousand)
@@ -186,7 +186,7 @@ def test_mppi_weighs_by_value_whatever_the_unit() -> None:
 @pytest.mark.parametrize(
     "change", [{"temperature": 0.0}, {"kept_elites": 1.1}, {"sample_decay": 0.9}]
 )
-def test_senseless_settings_are_refused(change: dict[str, float]) -> None:
+def test_invalid_settings_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         dataclasses.replace(plain_planner(), **change)
 
@@ -219,7 +219,7 @@ def _values(robots: int = 2) -> Tensor:
     return torch.randn(robots, CONFIG.samples, generator=torch.Generator().manual_seed(2))
 
 
-def test_it_draws_the_same_from_the_same_seed() -> None:
+def test_kernel_and_torch_draw_the_same_candidates() -> None:
     drawn = [
         search.propose(_belief(), 0, torch.Generator().manual_seed(3))
         for search in (KernelCrossEntropy(CONFIG), CrossEntropy(CONFIG))
@@ -260,6 +260,6 @@ def test_kernel_random_walk_is_bit_identical(size: int) -> None:
     )
 
 
-def test_what_is_not_on_the_processor_or_not_for_the_kernel_is_left_to_torch() -> None:
+def test_other_devices_and_backends_use_torch() -> None:
     assert isinstance(optimiser_of(CONFIG, "cuda"), CrossEntropy)
     assert isinstance(optimiser_of(PlannerConfig(backend="float32")), CrossEntropy)

@@ -26,7 +26,7 @@ A = spec.ACTION_DIM
 
 
 class Sight(NamedTuple):
-    """One tick's observation of E robots."""
+    """One step's observation of E robots."""
 
     depth: NDArray[np.uint16]
     state: NDArray[np.float32]
@@ -88,21 +88,21 @@ def test_the_policy_keeps_no_reference_to_the_callers_action() -> None:
     np.testing.assert_allclose(_led(policy.carry).numpy(), 0.2, atol=1e-6)
 
 
-def test_changing_the_action_reported_changes_nothing_else_that_was() -> None:
+def test_action_of_a_step_does_not_share_memory_with_its_plan() -> None:
     step = Policy(toy_model(), CONFIG, num_envs=1).act(*_see(1, 0))
     plan = step.plan.copy()
     step.action[:] = 9.0
     np.testing.assert_array_equal(step.plan, plan)
 
 
-def test_a_run_starts_from_nothing_with_the_neutral_action() -> None:
+def test_run_starts_with_zero_state_and_the_neutral_action() -> None:
     policy = Policy(CountingModel(), CONFIG, num_envs=2)
     policy.act(*_see(2, 0))
     assert not _led(policy.carry).any()
     assert policy.carry.h[:, CountingModel.COUNT].tolist() == [1, 1]
 
 
-def test_resetting_rows_forgets_them_and_only_them() -> None:
+def test_reset_of_rows_affects_only_these() -> None:
     policy = Policy(CountingModel(), CONFIG, num_envs=3)
     _run(policy, 3, robots=3)
     policy.advance(np.full((3, A), 0.5))
@@ -113,8 +113,8 @@ def test_resetting_rows_forgets_them_and_only_them() -> None:
     assert not _led(policy.carry)[1].any()
 
 
-class _Asked(NamedTuple):
-    """What the planner was asked, and answered."""
+class _PlanCall(NamedTuple):
+    """Arguments and result of a plan."""
 
     executed: Tensor
     warm: Tensor
@@ -122,9 +122,9 @@ class _Asked(NamedTuple):
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
+def plan_calls(monkeypatch: pytest.MonkeyPatch) -> list[_PlanCall]:
     """Every call of the planner by a policy."""
-    calls: list[_Asked] = []
+    calls: list[_PlanCall] = []
 
     def record(
         evaluator: PlanEvaluator[Carry],
@@ -137,32 +137,32 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
         remaining: Callable[[], float] | None,
     ) -> Plan:
         plan = make_plan(evaluator, optimiser, carry, executed, config, generator, warm, remaining)
-        calls.append(_Asked(executed.clone(), warm.clone(), plan))
+        calls.append(_PlanCall(executed.clone(), warm.clone(), plan))
         return plan
 
     monkeypatch.setattr("egovcp.plan.policy.make_plan", record)
     return calls
 
 
-def test_each_plan_starts_at_the_shifted_one_before(asked: list[_Asked]) -> None:
+def test_each_plan_starts_at_the_shifted_one_before(plan_calls: list[_PlanCall]) -> None:
     _run(Policy(CountingModel(drift=0.3), CONFIG, num_envs=2), 4)
-    assert not asked[0].warm.any()
-    for before, now in itertools.pairwise(asked):
+    assert not plan_calls[0].warm.any()
+    for before, now in itertools.pairwise(plan_calls):
         assert torch.equal(now.warm, shift(before.plan.deltas))
         assert before.plan.deltas.any()
 
 
 def test_a_row_after_its_reset_plans_from_the_neutral_action_at_rest(
-    asked: list[_Asked],
+    plan_calls: list[_PlanCall],
 ) -> None:
     policy = Policy(CountingModel(drift=0.3), CONFIG, num_envs=2)
     _run(policy, 3)
     policy.advance(np.full((2, A), 0.9))
     policy.reset(np.array([1]))
     step = policy.act(*_see(2, 3))
-    assert asked[-1].warm[0].any()
-    assert not asked[-1].warm[1].any()
-    np.testing.assert_allclose(asked[-1].executed.numpy(), [[0.9] * A, [0.0] * A], atol=1e-6)
+    assert plan_calls[-1].warm[0].any()
+    assert not plan_calls[-1].warm[1].any()
+    np.testing.assert_allclose(plan_calls[-1].executed.numpy(), [[0.9] * A, [0.0] * A], atol=1e-6)
     assert np.abs(step.action[1]).max() <= spec.ACTION_ETA + 1e-6
 
 
@@ -195,7 +195,7 @@ def test_a_seed_repeats_a_run_and_a_full_reset_starts_it_again() -> None:
     assert not np.array_equal(one[0].plan, other[0].plan)
 
 
-def test_a_robot_acts_the_same_alone_and_in_a_crowd() -> None:
+def test_actions_of_a_robot_do_not_depend_on_others() -> None:
     model = toy_model()
     crowd, alone = Policy(model, CONFIG, num_envs=3), Policy(model, CONFIG, num_envs=1)
     for tick in range(3):
@@ -221,7 +221,7 @@ def test_policy_step_has_its_shapes_and_stays_in_the_box() -> None:
 
 
 def test_the_plan_goes_on_from_the_one_before() -> None:
-    """Warm start: with hardly any search, a drift is followed farther tick by tick."""
+    """Warm start: with hardly any search, a drift is followed farther step by step."""
     lazy = plain_planner(samples=32, elites=4, iterations=1)
     policy = Policy(CountingModel(drift=0.25), lazy, num_envs=1, seed=1)
     values = []
@@ -246,7 +246,7 @@ def test_imagined_images_follow_the_plan_and_then_hold_its_last_action(horizon: 
         np.testing.assert_allclose(frames[:, -1], model.decode(carry)[0].numpy(), atol=1e-5)
 
 
-def test_looking_and_imagining_do_not_change_the_policy() -> None:
+def test_decoding_and_imagining_do_not_change_the_policy() -> None:
     model = toy_model()
     quiet, curious = (Policy(model, CONFIG, num_envs=1, seed=3) for _ in range(2))
     for tick in range(3):
@@ -273,7 +273,7 @@ def test_a_policy_puts_its_model_into_evaluation_mode() -> None:
 
 
 FAST_CONFIG = plain_planner(samples=32, elites=4, iterations=1, backend="float32")
-ROBOTS, TICKS, BAD_TICK, BAD_ROBOT = 3, 5, 2, 1
+ROBOTS, STEPS, BAD_STEP, BAD_ROBOT = 3, 5, 2, 1
 GRAVITY = spec.STATE_SLICES["projected_gravity"]
 
 type Observation = tuple[NDArray[np.uint16], NDArray[np.float32]]
@@ -287,12 +287,12 @@ def _observation(tick: int) -> Observation:
     return depth.astype(np.uint16), state.astype(np.float32)
 
 
-def _play(damage: Damage | None, ticks: range = range(TICKS)) -> tuple[Policy, list[PolicyStep]]:
-    """Act on every tick, with the observation of one robot at one tick damaged."""
+def _play(damage: Damage | None, ticks: range = range(STEPS)) -> tuple[Policy, list[PolicyStep]]:
+    """Act on every step, with the observation of one robot at one step damaged."""
     policy, steps = Policy(toy_model(), FAST_CONFIG, ROBOTS), list[PolicyStep]()
     for tick in ticks:
         depth, state = _observation(tick)
-        if damage is not None and tick == BAD_TICK:
+        if damage is not None and tick == BAD_STEP:
             damage(depth, state)
         steps.append(policy.act(depth, state))
         policy.advance(steps[-1].action)
@@ -320,17 +320,17 @@ SKIPPED = {
 def test_the_robot_recovers_and_the_skip_is_reported(name: str) -> None:
     policy, steps = _play(SKIPPED[name])
     for tick, step in enumerate(steps):
-        expected = [tick == BAD_TICK and robot == BAD_ROBOT for robot in range(ROBOTS)]
+        expected = [tick == BAD_STEP and robot == BAD_ROBOT for robot in range(ROBOTS)]
         assert step.skipped.tolist() == expected
         for array in (step.action, step.value, step.termination, step.plan):
             assert np.isfinite(array).all()
     assert all(part.isfinite().all() for part in policy.carry if part is not None)
-    plans = [step.plan[BAD_ROBOT] for step in steps[BAD_TICK + 1 :]]
+    plans = [step.plan[BAD_ROBOT] for step in steps[BAD_STEP + 1 :]]
     assert not np.array_equal(*plans), "the policy is frozen"
 
 
 @pytest.mark.parametrize("name", SKIPPED)
-def test_other_robots_act_as_if_nothing_had_happened(name: str) -> None:
+def test_skipped_observation_does_not_affect_other_robots(name: str) -> None:
     _, steps = _play(SKIPPED[name])
     _, undamaged = _play(None)
     others = [robot for robot in range(ROBOTS) if robot != BAD_ROBOT]
@@ -338,10 +338,10 @@ def test_other_robots_act_as_if_nothing_had_happened(name: str) -> None:
         np.testing.assert_array_equal(step.plan[others], expected.plan[others])
 
 
-def test_the_prior_predicts_the_state_of_a_skipped_tick() -> None:
-    policy, _ = _play(None, range(BAD_TICK))
+def test_prior_predicts_the_state_of_a_skipped_step() -> None:
+    policy, _ = _play(None, range(BAD_STEP))
     before, sent = policy.carry, policy._sent
-    depth, state = _observation(BAD_TICK)
+    depth, state = _observation(BAD_STEP)
     state[:] = np.nan
     policy.observe(depth, state)
     with torch.inference_mode():
@@ -371,13 +371,13 @@ def _fast_joints(depth: NDArray[np.uint16], state: NDArray[np.float32]) -> None:
 
 
 @pytest.mark.parametrize("damage", [_full_scale, _fast_joints])
-def test_impossible_finite_values_do_not_poison_the_carry(damage: Damage) -> None:
+def test_impossible_finite_values_do_not_enter_the_carry(damage: Damage) -> None:
     _, steps = _play(damage, range(20))
     _, undamaged = _play(None, range(20))
     assert all(np.isfinite(step.value).all() for step in steps)
     early, late = (
         np.abs(steps[tick].value[BAD_ROBOT] - undamaged[tick].value[BAD_ROBOT])
-        for tick in (BAD_TICK, 19)
+        for tick in (BAD_STEP, 19)
     )
     assert late < 0.2 * early
 
@@ -392,7 +392,7 @@ def test_depth_that_is_not_finite_is_invalid_depth() -> None:
     assert not found.skipped.any()
 
 
-def test_an_action_that_is_not_finite_was_not_sent() -> None:
+def test_advance_refuses_an_action_that_is_not_finite() -> None:
     policy, _ = _play(None, range(1))
     with pytest.raises(UsageError, match="not finite"):
         policy.advance(np.full((ROBOTS, spec.ACTION_DIM), np.nan))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from egovcp.sim.config import ArchConfig, EnvConfig, EpisodeConfig
+from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.env import VectorEnv
+from egovcp.sim.tasks.arch import ArchConfig
 
 SOON = EpisodeConfig(ticks=45, event_ticks=(3, 6), empty_probability=0.0)
 
 
 @pytest.fixture(scope="session")
 def config() -> EnvConfig:
-    """Episodes in which the event comes soon, for the controller that is cheaper to run."""
+    """Episodes in which the event comes soon."""
     return EnvConfig(
-        controller="stance",
         arch=ArchConfig(distance_range=(0.9, 1.0)),
         ball_episode=SOON,
         wall_episode=SOON,

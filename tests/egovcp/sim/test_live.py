@@ -12,7 +12,7 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.live import LiveRobot, Measurement, Phase, ServoCommand
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_DIM, STATE_SLICES
+from egovcp.spec import ACTION_BOX, ACTION_TERMS, COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -28,7 +28,7 @@ class Loop:
 
     def __init__(self, live: LiveRobot) -> None:
         self.live = live
-        self.controller = make_controller("stance")
+        self.controller = make_controller(live.config.controller)
         self.controller.reset(self.state(live.measure())[None])
 
     def state(self, seen: Measurement) -> NDArray[np.float64]:
@@ -71,9 +71,7 @@ def test_it_is_the_episode_of_the_environment(
     names: set[str] = set()
     while not env.done[0]:
         result = env.step(np.zeros((1, 7)))
-        terms = {
-            k: v[0] for k, v in result.reward_terms.items() if k not in ("pose", "guard", "crouch")
-        }
+        terms = {k: v[0] for k, v in result.reward_terms.items() if k not in ACTION_TERMS}
         total += sum(terms.values())
         names |= set(terms)
         np.testing.assert_allclose(

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.config import BallConfig, EnvConfig, EpisodeConfig, SequenceConfig
+from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.env import StepResult, VectorEnv
 from egovcp.sim.policies import EnvPolicy, Hold, Oracle
-from egovcp.sim.scenario import SEQUENCE, Scenario
+from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HEAD
 from egovcp.sim.tasks.arch import ArchTask
-from egovcp.sim.tasks.ball import BallTask
-from egovcp.sim.tasks.sequence import SequenceTask
+from egovcp.sim.tasks.ball import BallConfig, BallTask
+from egovcp.sim.tasks.sequence import SequenceConfig, SequenceTask
 from egovcp.spec import ACTION_DIM
 
 HOLD = np.zeros((1, ACTION_DIM))
@@ -25,12 +25,13 @@ HOLD = np.zeros((1, ACTION_DIM))
 @pytest.fixture(scope="module")
 def sequences(config: EnvConfig) -> EnvConfig:
     """An arch, half a second later a box."""
-    return replace(config, ball=BallConfig(shape="box"), sequence=SequenceConfig(pause_ticks=12))
+    parts = SequenceConfig(("arch", "ball"), pause_ticks=12)
+    return replace(config, ball=BallConfig(shape="box"), sequence=parts)
 
 
 def begun(config: EnvConfig) -> tuple[VectorEnv, SequenceTask]:
     env = VectorEnv(config, 1, render_depth=False)
-    env.reset([Scenario(SEQUENCE, 0, 0)])
+    env.reset([Scenario("sequence", 0, 0)])
     task = env.instances[0].task
     assert isinstance(task, SequenceTask)
     return env, task
@@ -38,7 +39,7 @@ def begun(config: EnvConfig) -> tuple[VectorEnv, SequenceTask]:
 
 def play(config: EnvConfig, policy: EnvPolicy, rows: int = 4) -> StepResult:
     env = VectorEnv(config, rows, render_depth=False)
-    scenarios = [Scenario(SEQUENCE, 0, i) for i in range(rows)]
+    scenarios = [Scenario("sequence", 0, i) for i in range(rows)]
     env.reset(scenarios)
     policy.reset(env, scenarios)
     while not env.done.all():
@@ -59,7 +60,7 @@ def test_the_oracle_achieves_three_parts(sequences: EnvConfig) -> None:
     three = replace(sequences, sequence=SequenceConfig(("arch", "ball", "wall"), pause_ticks=12))
     result = play(three, Oracle())
     assert list(result.parts[0]) == ["arch", "ball", "wall"]
-    for part in result.parts[0]:  # the wall as well, which is pressed as long as it is there
+    for part in result.parts[0]:
         assert np.mean([parts[part] for parts in result.parts]) >= 0.75, part
 
 
@@ -167,7 +168,7 @@ def test_what_has_not_begun_is_not_won(sequences: EnvConfig) -> None:
 
 
 def test_a_fall_is_held_against_the_part_it_ends(sequences: EnvConfig) -> None:
-    env, task = begun(replace(sequences, sequence=SequenceConfig(pause_ticks=0)))
+    env, task = begun(replace(sequences, sequence=SequenceConfig(("arch", "ball"), pause_ticks=0)))
     oracle = Oracle()
     while task.current_name == "arch":
         env.step(oracle.act(env))
@@ -183,19 +184,22 @@ def test_a_fall_is_held_against_the_part_it_ends(sequences: EnvConfig) -> None:
     assert not result.success[0]
 
 
-def test_contacts_are_those_of_the_present_part(sequences: EnvConfig) -> None:
+def test_rewards_and_contacts_are_those_of_the_present_part(sequences: EnvConfig) -> None:
     near = replace(sequences.arch, distance_range=(0.5, 0.6))
     env, task = begun(replace(sequences, arch=near))
-    head = np.zeros(1)
-    while not head.any():
+    hit = np.zeros(1)
+    while not hit.any():
         result = env.step(HOLD)
-        head = result.reward_terms["head"]
+        hit = result.reward_terms["hit"]
     assert env.privileged_state().contact_force[0, HEAD] > 0
     arch = task._part
     assert isinstance(arch, ArchTask)
     assert not arch.achieved
     assert not task.parts["arch"]
-    assert result.reward_terms["hit"][0] == 0.0
+    assert hit[0] == -sequences.arch.hit_cost
+    ball = task._parts[1]
+    assert isinstance(ball, BallTask)
+    assert not ball.hit
 
 
 def test_the_walking_command_ends_before_the_throw(sequences: EnvConfig) -> None:
@@ -222,7 +226,7 @@ def test_parts_that_cannot_follow_each_other_are_refused(
     parts: tuple[str, ...], message: str
 ) -> None:
     with pytest.raises(UsageError, match=message):
-        SequenceConfig(parts)
+        EnvConfig(sequence=SequenceConfig(parts))
 
 
 def test_names_are_no_range(config: EnvConfig) -> None:

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 
 from egovcp.errors import UsageError
-from egovcp.robot.stance import StanceController
-from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, EpisodeConfig, WallConfig
+from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
+from egovcp.sim.live import LiveRobot
 from egovcp.sim.robot import Contact
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HEAD, PARTS, TORSO, build_scene
-from egovcp.sim.tasks.arch import ArchTask
-from egovcp.sim.tasks.ball import BallTask
-from egovcp.spec import ACTION_DIM, TASKS
+from egovcp.sim.tasks import find_task, task_names
+from egovcp.sim.tasks.arch import ArchConfig, ArchTask
+from egovcp.sim.tasks.ball import BallConfig, BallTask
+from egovcp.sim.tasks.sequence import SequenceConfig
+from egovcp.sim.tasks.wall import WallConfig
+from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT, REWARD_TERMS
+
+TASKS = task_names(training=True)
 
 HOLD = np.zeros((4, ACTION_DIM))
 HAND, ARM = PARTS.index("left_hand"), PARTS.index("left_arm")
@@ -110,9 +115,9 @@ def test_first_contacts_count_by_part(
     task = thrown(env)
     task.process_contacts([Contact(part, 10.0) for part in parts])
     assert (task.blocked, task.hit) == (blocked, hit)
-    terms = task.rewards(np.zeros(ACTION_DIM))
-    assert (terms["block"] > 0, terms["hit"] < 0) == (blocked, hit)
-    assert task.rewards(np.zeros(ACTION_DIM))["block"] == 0.0
+    terms = task.rewards()
+    assert (terms["block"], terms["hit"]) == (float(blocked), -float(hit))
+    assert not any(task.rewards().values())
 
 
 @pytest.mark.parametrize(("steps", "hit"), [(20, False), (80, True)])
@@ -133,25 +138,26 @@ def test_a_hand_after_a_hit_blocks_nothing(env: VectorEnv) -> None:
     assert not task.blocked
 
 
-def test_leaving_the_neutral_pose_costs(env: VectorEnv) -> None:
-    task = thrown(env)
-    assert task.rewards(np.zeros(ACTION_DIM))["pose"] == 0.0
-    assert task.rewards(np.ones(ACTION_DIM))["pose"] == pytest.approx(-task.config.pose_cost)
+@pytest.mark.parametrize("task", task_names())
+def test_actions_cost_the_same_in_every_task(config: EnvConfig, task: str) -> None:
+    env = VectorEnv(replace(config, pose_cost=0.5, action_rate_cost=0.2), 1)
+    begin(env, task)
+    action = np.linspace(-0.3, 0.3, ACTION_DIM)[None]
+    assert env.step(0.0 * action).reward_terms["pose"] == 0.0
+    result = env.step(action)
+    pose, rate = 0.5 * np.mean(action**2), 0.2 * np.mean((action / ACTION_RATE_LIMIT) ** 2)
+    assert result.reward_terms["pose"][0] == pytest.approx(-pose)
+    assert result.reward_terms["action_rate"][0] == pytest.approx(-rate)
+    assert result.reward[0] == pytest.approx(-pose - rate)
+    assert env.step(action).reward_terms["action_rate"][0] == 0.0
 
 
-@pytest.mark.parametrize(("empty", "dear"), [(0.0, 4), (1.0, 8)])
-def test_a_guard_at_the_wall_costs_more_until_the_push(
-    config: EnvConfig, empty: float, dear: int
-) -> None:
-    timing = EpisodeConfig(ticks=20, event_ticks=(5, 5), empty_probability=empty)
-    env = VectorEnv(replace(config, wall_episode=timing), 1)
-    begin(env, "wall")
-    guard = np.full((1, ACTION_DIM), 0.25)  # within what one tick allows
-    terms = [env.step(guard).reward_terms for _ in range(8)]
-    # the fifth tick ends when the push begins, and counts as disturbed
-    expected = [-config.wall.guard_cost / 16] * dear + [0.0] * (8 - dear)
-    assert [float(t["guard"][0]) for t in terms] == pytest.approx(expected)
-    assert [float(t["pose"][0]) for t in terms] == pytest.approx([-config.wall.pose_cost / 16] * 8)
+@pytest.mark.parametrize("task", task_names())
+def test_the_terms_of_a_task_are_terms_of_the_specification(env: VectorEnv, task: str) -> None:
+    begin(env, task)
+    terms, columns = env.step(HOLD).reward_terms, env.instances[0].task.reward_terms
+    assert set(terms) == set(columns)
+    assert set(columns.values()) <= set(REWARD_TERMS)
 
 
 def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
@@ -167,70 +173,76 @@ def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
     assert np.all((fastest > 0.2) & (fastest < 0.6))
 
 
-def test_an_unbraced_push_ends_at_the_wall_and_a_touch_is_remembered(config: EnvConfig) -> None:
-    push = WallConfig(push_speed_range=(0.55, 0.55), away_probability=0.0)
+def test_an_unbraced_push_ends_at_the_wall_and_costs_once(config: EnvConfig) -> None:
+    push = WallConfig(push_speed_range=(1.0, 1.0), away_probability=0.0)
     env = VectorEnv(replace(config, wall=push), 4)
     begin(env, "wall")
     distance = [p["distance"] for p in env.parameters]
     gap = env.privileged_state().object_b[:, 0]
     np.testing.assert_allclose(gap, distance, atol=0.02)
+    hit = np.zeros(4)
     for _ in range(45):
         result = env.step(HOLD)
+        hit += result.reward_terms["hit"]
     assert not result.success.any()
+    np.testing.assert_array_equal(hit, -1.0)
 
 
-def test_the_arch_moves_at_the_commanded_speed(env: VectorEnv) -> None:
+@pytest.mark.parametrize(("part", "cost"), [(HAND, 0.0), (ARM, 1.0), (HEAD, 1.0)])
+def test_only_hands_may_touch_the_wall(env: VectorEnv, part: int, cost: float) -> None:
+    begin(env, "wall")
+    task = env.instances[0].task
+    task.process_contacts([Contact(part, 10.0)])
+    assert [task.rewards()["hit"] for _ in range(2)] == [-cost, 0.0]
+    assert task.achieved is (cost == 0.0)
+
+
+def test_the_arch_is_located_by_the_lower_edge_of_its_lintel(env: VectorEnv) -> None:
     begin(env, "arch")
-    for _ in range(8):
-        env.step(HOLD)
-    before = env.privileged_state().object_w
-    env.step(HOLD)
-    moved = env.privileged_state().object_w - before
-    speed = np.array([p["speed"] for p in env.parameters])
-    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), speed * 0.04, rtol=1e-3)
+    state = env.privileged_state()
+    drawn = [(p["distance"], p["lateral"]) for p in env.parameters]
+    np.testing.assert_allclose(state.object_b[:, :2], drawn, atol=1e-6)
+    np.testing.assert_allclose(state.object_w[:, 2], [p["clearance"] for p in env.parameters])
+    lintel = {solid.name: solid for solid in state.solids[0]}["arch_lintel"]
+    assert lintel.position_w[2] - lintel.size[2] == pytest.approx(state.object_w[0, 2])
 
 
-def test_an_upright_robot_hits_the_arch_with_its_head(config: EnvConfig) -> None:
+def test_an_upright_robot_hits_the_arch_once(config: EnvConfig) -> None:
     near = ArchConfig(distance_range=(0.5, 0.6))
     env = VectorEnv(replace(config, arch=near), 4)
     begin(env, "arch")
-    head = np.zeros(4)
+    hit = np.zeros(4)
     for _ in range(60):
-        head += env.step(HOLD).reward_terms["head"]
-    assert np.all(head < 0)
+        hit += env.step(HOLD).reward_terms["hit"]
+    np.testing.assert_array_equal(hit, -1.0)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_depth_image_shows_the_object_at_its_position(env: VectorEnv, task: str) -> None:
-    """Empty-scene depth and the scene's differ, so the object is in the image."""
+    """The camera looks over the floor, so what is near is the object."""
     begin(env, task)
     for _ in range(14):
         result = env.step(HOLD)
     near = result.observation.depth[0] < 3600
-    assert np.mean(near & (result.observation.depth[0] > 0)) > 0.01
+    assert np.mean(near & (result.observation.depth[0] > 0)) > 0.002
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_collision_geom_of_the_robot_has_a_part(task: str) -> None:
-    scene = build_scene(task, "points")
+    scene = build_scene(find_task(task).scene_tasks(EnvConfig()), "points")
     named = {PARTS[p] for p in scene.index.part if p >= 0}
     assert named == set(PARTS)
     assert scene.index.part[scene.index.floor] == -1
     assert not np.any(scene.index.is_object & (scene.index.part >= 0))
 
 
-class _SaysItWalks(StanceController):
-    walks = True
-
-
 def walked(config: EnvConfig) -> tuple[VectorEnv, ArchTask]:
-    """An arch that stands, and a robot that is due to walk."""
-    standing = replace(config, arch=ArchConfig(motion="walk"))
-    env = VectorEnv(standing, 1, _SaysItWalks())
+    """A robot that begins to walk to an arch."""
+    env = VectorEnv(replace(config, arch=ArchConfig()), 1)
     begin(env, "arch")
     task = env.instances[0].task
     assert isinstance(task, ArchTask)
-    while not task.moving:
+    while not task.under_way:
         env.step(HOLD[:1])
     return env, task
 
@@ -245,16 +257,13 @@ def carry(task: ArchTask, forward: float, left: float = 0.0, turn: float = 0.0) 
     task.before_step()
 
 
-def test_a_standing_arch_is_approached_by_walking_only(config: EnvConfig) -> None:
+def test_the_arch_stands_still(config: EnvConfig) -> None:
     env, task = walked(config)
-    before, place = task._ahead, task.robot.data.mocap_pos[0].copy()
-    env.step(HOLD[:1])
-    assert task._ahead == pytest.approx(before, abs=0.01)
-    task.begin_tick()
+    place = task.robot.data.mocap_pos[0].copy()
+    before = task._ahead
     carry(task, 0.2)
     assert task._ahead == pytest.approx(before - 0.2, abs=0.01)
-    earned = task.rewards(HOLD[0])["progress"]
-    assert earned == pytest.approx(0.2 * ArchConfig().progress_reward, rel=1e-2)
+    env.step(HOLD[:1])
     np.testing.assert_array_equal(task.robot.data.mocap_pos[0], place)
     assert not task.state().velocity_w.any()
 
@@ -271,12 +280,37 @@ def test_a_walking_robot_is_kept_on_course(config: EnvConfig) -> None:
 def test_having_walked_through_the_arch_it_stops(config: EnvConfig) -> None:
     _, task = walked(config)
     carry(task, task._ahead + 0.6)
-    terms = task.rewards(HOLD[0])
-    assert terms["pass"] == ArchConfig().pass_reward
+    assert [task.rewards()["pass"] for _ in range(2)] == [ArchConfig().pass_reward, 0.0]
     assert task.achieved
     assert not task.velocity_command.any()
 
 
-def test_a_controller_that_cannot_walk_is_not_sent_through_the_arch(config: EnvConfig) -> None:
-    with pytest.raises(UsageError, match=r"arch\.motion=walk.*does not walk.*--env\.controller"):
-        VectorEnv(replace(config, arch=ArchConfig(motion="walk")), 1)
+def test_a_touched_arch_is_not_passed(config: EnvConfig) -> None:
+    _, task = walked(config)
+    task.process_contacts([Contact(HAND, 1.0)])
+    carry(task, task._ahead + 0.6)
+    assert task.rewards() == {"pass": 0.0, "hit": -ArchConfig().hit_cost}
+    assert task.finished
+    assert not task.achieved
+
+
+@pytest.mark.parametrize("task", ["arch", "sequence"])
+def test_a_controller_that_does_not_walk_is_refused_for_the_arch(
+    config: EnvConfig, task: str
+) -> None:
+    env = VectorEnv(replace(config, controller="stance"), 4)
+    message = rf"task {task}.*'stance' does not walk.*--env\.controller=walk"
+    with pytest.raises(UsageError, match=message):
+        begin(env, task)
+    begin(env, "ball")
+    with pytest.raises(UsageError, match=message):
+        env.reset_rows([0], [Scenario(task, 0, 0)])
+    with pytest.raises(UsageError, match=message):
+        LiveRobot(env.config).start(Scenario(task, 0, 0))
+
+
+def test_a_sequence_without_an_arch_needs_no_walking(config: EnvConfig) -> None:
+    parts = SequenceConfig(("ball", "wall"))
+    env = VectorEnv(replace(config, controller="stance", sequence=parts), 1)
+    env.reset([Scenario("sequence", 0, 0)])
+    assert env.instances[0].task.current_name == "ball"

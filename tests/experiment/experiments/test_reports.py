@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from egovcp_experiment.cell import ARTIFACT, COLLECT, PLAY, Cell, CellOutput
 from egovcp_experiment.config import SCALES
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report import ExperimentReport, Plot, Table
-from egovcp_experiment.studies.open_loop import HORIZONS
 
 _PARTS = "env.sequence.parts"
 
@@ -59,6 +59,7 @@ def records(name: str, share: float) -> dict[str, Mapping[str, Any]]:
     return {**{c.name: collected for c in cells if c.command is COLLECT}, **found}
 
 
+@cache
 def report(name: str, share: float) -> ExperimentReport:
     return EXPERIMENTS[name].report(SCALES["small"](), records(name, share))
 
@@ -71,7 +72,7 @@ def test_every_report_works_without_results(name: str) -> None:
     assert not [part for part in found.parts if isinstance(part, Plot)]
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.4, 1.0])
 @pytest.mark.parametrize("name", CLOSED_LOOP)
 def test_tables_agree_with_their_heads(name: str, share: float) -> None:
     found = report(name, share)
@@ -158,26 +159,6 @@ def test_multitask_names_the_models_that_were_not_trained() -> None:
     assert words({}).startswith("Every model was trained for 10 minutes: the one on mixed data")
     some = words({"ball": "policy", "all": "me/model"})
     assert some.startswith("Every model except those given for ball, all (`--train.policies`) was")
-
-
-def test_interpret_reports_the_ball_in_decoded_images() -> None:
-    def errors(k: int) -> dict[str, Any]:
-        everywhere = {"model": 0.1, "repeat": 0.2, "model_moving": None, "repeat_moving": None}
-        ball = {"ball_images": 5, "model_ball": k / 10, "repeat_ball": k / 5, "ball_detected": 0.6}
-        gone = {"ball_images": 0, "model_ball": None, "repeat_ball": None, "ball_detected": None}
-        return {**everywhere, **(ball if k < 16 else gone)}
-
-    found = {"episodes": 5, "errors_m": {str(k): errors(k) for k in HORIZONS}, "strips": []}
-    made = EXPERIMENTS["interpret"].report(
-        SCALES["small"](), {"open_loop-ball": {"figures": found}}
-    )
-    assert made.shows == (
-        "ball: 4, 8, 12, 16 ticks ahead, the depth of the ball in the decoded image is off by "
-        "40, 80, 120, - cm; repeating the last image by 80, 160, 240, - cm",
-    )
-    _, table = (part for part in made.parts if isinstance(part, Table))
-    assert table.rows[4] == ("8", "5", "80.0", "160.0", "60.0 %")
-    assert table.rows[8] == ("16", "0", "-", "-", "-")
 
 
 def test_ablations_name_the_best_choice() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from egovcp.artifact import save_artifact
 from egovcp.plan import PlannerConfig
-from egovcp.robot.stance import StanceController
+from egovcp.robot.controllers import WALK, make_controller
 from egovcp.testing import toy_model
 
 
@@ -18,7 +18,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("policy") / "policy"
     planner = PlannerConfig(samples=16, horizon=2, iterations=1, elites=4)
     provenance = {
-        "controller_id": StanceController().id,
+        "controller_id": make_controller(WALK).id,
         "train_config": {"returns": {"gamma": 0.97, "steps": 8}},
     }
     save_artifact(path, toy_model(), planner, provenance)
@@ -37,6 +37,5 @@ def flags(policy: Path, tmp_path: Path) -> list[str]:
         f"--policy.path={policy}",
         f"--output_dir={tmp_path / 'out'}",
         "--episodes=2",
-        "--env.controller=stance",
         *scenes,
     ]

@@ -68,5 +68,5 @@ def test_planner_options_change_the_planner(
 def test_an_artifact_of_another_controller_is_refused(
     flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*flags, "--env.controller=walk"]) == 4
+    assert main([*flags, "--env.controller=stance"]) == 4
     assert "low-level controller" in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from egovcp_experiment.studies.residuals import (
 
 def _config(ticks: int) -> EnvConfig:
     quiet = EpisodeConfig(ticks=ticks, event_ticks=(3, 3), empty_probability=1.0)
-    return replace(EnvConfig(controller="stance"), ball_episode=quiet)
+    return EnvConfig(controller="stance", ball_episode=quiet, pose_cost=0.01, action_rate_cost=0.0)
 
 
 def _branch(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,11 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
     """Redirect this process, whose libraries have read their variables already.
 
     Replaces the constants of `huggingface_hub`, and of `datasets` and `lerobot` if they
-    are imported, until the block ends.
+    are imported, until the block ends. An interrupted download goes on at once, where the
+    library waits 1 s.
     """
     import huggingface_hub
-    from huggingface_hub import constants
+    from huggingface_hub import constants, file_download
 
     variables = environment(endpoint, home)
     with contextlib.ExitStack() as stack:
@@ -54,6 +56,8 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
             "HF_HUB_OFFLINE": False,
         }.items():
             stack.enter_context(mock.patch.object(constants, name, value))
+        impatient = mock.Mock(wraps=time, sleep=lambda seconds: None)
+        stack.enter_context(mock.patch.object(file_download, "time", impatient))
         if (config := sys.modules.get("datasets.config")) is not None:
             stack.enter_context(mock.patch.object(config, "HF_ENDPOINT", endpoint))
         huggingface_hub.HfFileSystem.clear_instance_cache()

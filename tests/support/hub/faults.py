@@ -11,8 +11,9 @@ type Trouble = int | Literal["reset", "stall", "truncate", "lose"]
 """What to do to a request: answer it with that HTTP status, or
 
 - ``reset``: break the connection instead of answering,
-- ``stall``: send half of the answer's body, then nothing,
-- ``truncate``: send half of the answer's body, then close the connection,
+- ``stall``: send half of the answer's body, then nothing; no answer if it has no body,
+- ``truncate``: send half of the answer's body, then close the connection; break it if the body is
+  empty, and answer a HEAD request as usual,
 - ``lose``: do what was asked, then break the connection.
 """
 

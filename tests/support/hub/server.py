@@ -134,9 +134,12 @@ class _Handler(BaseHTTPRequestHandler):
         for _ in request.body:  # what no route has read: the connection is used again
             pass
         half = trouble in ("stall", "truncate")
-        if trouble == "stall" and answer.size == 0:
+        if trouble == "truncate" and self.command == "HEAD":
+            half = False  # complete without a body: the client uses the connection again
+        empty = answer.size == 0 or self.command == "HEAD"
+        if trouble == "stall" and empty:
             self.hub.closing.wait(_STALL_S)
-        if trouble == "lose" or (half and answer.size == 0):
+        if trouble == "lose" or (half and empty):
             return self._break()
         return self._send(answer, half, stall=trouble == "stall")
 

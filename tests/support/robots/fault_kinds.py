@@ -229,7 +229,7 @@ _MOTORS: Final = (
     _motor(
         "no status, mode and temperature",
         _R,
-        _edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature")),
+        _edited(m.without_motor_fields("motorstate", "mode", "temperature")),
     ),
     _motor("dropped, status disconnected", _D, _dropped(DISCONNECTED, 1), "lost the connection"),
     _motor("dropped, mode off", _D, _dropped(0, 0), "its mode is off"),

@@ -30,8 +30,8 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.live.control_process import RECEIVING, control_process, raised_priority
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.control_process import RECEIVING, control_process
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
 from egovcp_deploy.live.link import Link, decode_observation, encode_operator_command, encode_plan
 from egovcp_deploy.live.processes import DampingWatchdog, standby_body
 from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage
@@ -42,6 +42,7 @@ from egovcp_deploy.robots.fake.command import StepPacer
 from egovcp_deploy.robots.wire import MalformedMessage, decode_command
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 
+from .fake_g1 import raised_priority
 from .stream_proxy import StreamFault, StreamProxy
 
 Array = NDArray[np.float64]
@@ -238,15 +239,14 @@ class FaultRig:
     def _start(self, stack: ExitStack) -> None:
         ports, fov = self.fake.ports, self._robot.config.camera.vertical_fov
         bridge = BridgeConfig(state_port=self.proxy.port, command_port=ports.command_port)
-        camera = ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov)
-        hardware = HardwareOptions(bridge, replace(CameraOptions(), server=camera))
+        camera = CameraOptions(server=ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov))
         address = f"ipc://{stack.enter_context(tempfile.TemporaryDirectory())}/link"
         with raised_priority(RECEIVING):
             link = Link(address, serve=True)
         stack.callback(link.close)
         self._outbox.clear()
         spare = stack.enter_context(standby_body(bridge))
-        setup = ControlSetup(hardware, "stance", LIMITS, address, os.getpid())
+        setup = ControlSetup(bridge, camera, "stance", LIMITS, address, os.getpid())
         self._mode, self._ending = "", False
         self.process: BaseProcess = _FORKSERVER.Process(
             target=_run_control_process, args=(setup,), daemon=True

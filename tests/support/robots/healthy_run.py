@@ -17,9 +17,7 @@ from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import evaluation_config
-from egovcp.sim.env import privileged_state
 from egovcp.sim.live import LiveRobot, Phase
-from egovcp.sim.policies import oracle_action
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
 from egovcp_deploy.live.control import ControlLoop
@@ -124,8 +122,7 @@ class _OraclePolicy:
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
         """A plan of one action."""
-        truth = privileged_state([self._robot.instance])
-        action = oracle_action(truth, 0).astype(np.float32)[None]
+        action = self._robot.instance.task.oracle().astype(np.float32)[None]
         return PolicyStep(action, action[:, None], iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:

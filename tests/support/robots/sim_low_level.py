@@ -39,7 +39,7 @@ class SimClock:
 
 
 class SimLowLevelRobot:
-    """`LowLevelRobot` and `CommandedRobot` of a `LiveRobot` in an episode. The last command holds.
+    """`LowLevelRobot` of a `LiveRobot` in an episode; also a robot of `EpisodeSequencer`.
 
     Args:
         robot: the simulation.

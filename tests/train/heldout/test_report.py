@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from egovcp import spec
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import evenly_spaced
@@ -304,3 +305,30 @@ def test_recorded_episodes_are_whole_and_padded(dataset_root) -> None:
     assert few.identities == tuple(store.identities[i] for i in (0, 4, 7))
     (group,) = episode_batches(store, torch.device("cpu"), per_task=2)
     assert len(group.batch.valid) == 2
+
+
+# --- the object --------------------------------------------------------------------------
+def test_the_error_of_the_object_is_its_distance_over_known_rows() -> None:
+    model, batch = toy_model(), random_batch(2, 5)
+    batch.valid[1, 3:] = False
+    with torch.no_grad():
+        found = model.object_position(filter_sequence(model, batch, sample=False).carry)
+    batch.object[..., :3] = found + torch.tensor([0.3, 0.0, 0.4])
+    batch.object[~batch.object_known] = 100.0
+    result = measure(model, [EpisodeBatch("ball", batch), EpisodeBatch("wall", batch)])
+    assert result.metrics["object_rmse_m"] == pytest.approx(0.5, rel=1e-4)
+    assert scalars(result.tasks)["wall/object_rmse_m"] == pytest.approx(0.5, rel=1e-4)
+    assert "object  position 0.500 m RMSE" in table(result.tasks)
+
+
+@pytest.mark.parametrize("decodes", [True, False])
+def test_without_a_known_object_or_a_decoder_there_is_no_error(decodes: bool) -> None:
+    model, batch = toy_model(), random_batch(2, 5)
+    if decodes:
+        batch.privileged[..., spec.OBJECT_KNOWN] = 0.0
+    else:
+        model = model.without_object_head()
+    result = measure(model, [EpisodeBatch("ball", batch)])
+    assert result.tasks["ball"]["object_rmse_m"] is None
+    assert "object_rmse_m" not in result.metrics
+    assert "object" not in table(result.tasks)

@@ -21,6 +21,7 @@ from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM, TorsoMotion
 SILENT = SensorConfig(0.0, 0.0, 0.0, 0.0)
 STANDING = CommandConfig(standing=1.0, still_hands=1.0)
 PLAIN = DisturbanceConfig(
+    wall=0.0,
     push=(0.0, 0.0),
     payload=(0.0, 0.0),
     mass_scale=(1.0, 1.0),
@@ -138,6 +139,32 @@ def test_a_push_is_a_change_of_the_horizontal_velocity():
         env.step(_zero(env))
         fastest = max(fastest, float(np.linalg.norm(env.physics.qvel[:, :2], axis=1).max()))
     assert 0.3 < fastest < 0.7
+
+
+def test_a_standing_robot_that_is_pushed_at_a_wall_braces_on_it_and_lets_go():
+    speed = (0.4, 0.4)
+    config = replace(PLAIN, wall=1.0, wall_push=(speed, speed), push_interval=(8.0, 8.0))
+    env = _env(commands=STANDING, disturbances=config)
+    env._next_push[:] = 10
+    gaps, palms, walls = [], [], []
+    for _ in range(9):
+        env.step(_zero(env))
+        assert not env.walls.active.any()
+    for _ in range(320):
+        env.step(_zero(env))
+        x = env.physics.snapshot()
+        normal = np.stack([np.cos(env.walls.yaw), np.sin(env.walls.yaw)], axis=1)[:, None]
+        to_wall = (env.walls.position[:, None, :2] - x.palms[..., :2]) * normal
+        palms.append(np.where(env.walls.active, to_wall.sum(-1).min(axis=1), np.nan))
+        gaps.append(env.walls.distance(x))
+        walls.append(env.walls.active.copy())
+    walls, palms, gaps = np.array(walls), np.array(palms), np.array(gaps)
+    assert walls[0].all()
+    assert not walls[-10:].any()
+    assert np.all((gaps[0] > 0.5) & (gaps[0] < 0.85))
+    nearest = np.nanmin(palms, axis=0)
+    assert (nearest < 0.08).any(), "no palm reached the wall"
+    assert (nearest > -0.02).all(), "a palm is inside the wall"
 
 
 def test_steps_cost_nothing_for_a_while_after_a_push():

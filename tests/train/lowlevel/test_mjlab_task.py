@@ -15,8 +15,6 @@ from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 
 pytestmark = pytest.mark.timeout(900)  # Warp compiles its kernels once
 
-task_module = pytest.importorskip("egovcp_train.lowlevel.mjlab_task")
-terms_module = pytest.importorskip("egovcp_train.lowlevel.mjlab_terms")
 N = 3
 PLAIN = DisturbanceConfig(
     push_interval=(90.0, 99.0),
@@ -29,9 +27,18 @@ PLAIN = DisturbanceConfig(
 
 
 @pytest.fixture(scope="module")
-def env():
+def task_module():
+    """Imported by the one process that runs these tests: it takes seconds."""
+    return pytest.importorskip("egovcp_train.lowlevel.mjlab_task")
+
+
+@pytest.fixture(scope="module")
+def env(task_module):
+    import warp
     from mjlab.envs import ManagerBasedRlEnv
 
+    warp.config.optimization_level = 0  # compiling takes longer than the few steps
+    warp.config.cpu_compiler_flags = None
     cfg = task_module.env_cfg(N, LowLevelTask(disturbances=PLAIN), WalkConfig())
     cfg.seed = 0
     env = ManagerBasedRlEnv(cfg, device="cpu")
@@ -40,7 +47,7 @@ def env():
     env.close()
 
 
-def test_mjlab_finds_the_task_by_its_entry_point():
+def test_mjlab_finds_the_task_by_its_entry_point(task_module):
     from mjlab.tasks.registry import list_tasks
 
     (entry,) = entry_points(group="mjlab.tasks").select(name="egovcp")
@@ -48,7 +55,7 @@ def test_mjlab_finds_the_task_by_its_entry_point():
     assert task_module.TASK_ID in list_tasks()
 
 
-def test_mjlabs_command_line_reaches_every_number():
+def test_mjlabs_command_line_reaches_every_number(task_module):
     import tyro
     from mjlab import TYRO_FLAGS
     from mjlab.scripts.train import TrainConfig
@@ -113,10 +120,11 @@ def test_a_robot_that_falls_starts_anew(env):
     assert not terminated.any()
 
 
-def test_a_checkpoint_comes_with_the_controllers_file(env, tmp_path):
+def test_a_checkpoint_comes_with_the_controllers_file(env, task_module, tmp_path):
     from mjlab.rl import RslRlVecEnvWrapper
 
     from egovcp.robot.controllers import make_controller
+    from egovcp_train.lowlevel.mjlab_terms import logic_term
 
     def runner() -> object:
         cfg = task_module.rl_cfg()
@@ -127,7 +135,7 @@ def test_a_checkpoint_comes_with_the_controllers_file(env, tmp_path):
 
     first = runner()
     first.learn(1)
-    logic = terms_module.logic_term(env).logic
+    logic = logic_term(env).logic
     logic.difficulty = 0.5
     first.save(str(tmp_path / "model_1.pt"))
     logic.difficulty = 0.0

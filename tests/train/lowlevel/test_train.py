@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from egovcp import packages
+from egovcp.robot.controllers import load_walk_policy
 from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import OBSERVATION_DIM, WalkConfig, WalkingController
 from egovcp.sim.config import SensorConfig
@@ -42,6 +43,20 @@ def test_a_run_leaves_a_controller_that_drives_the_robot(run: Path):
     state[:, 5] = -1.0
     assert np.isfinite(WalkingController(policy).step(state)).all()
     assert (run / LAST).stat().st_size < 2_000_000
+
+
+def test_a_run_from_a_controller_takes_its_parameters_unless_they_are_given(tmp_path: Path):
+    flags = ["--init=walk", "--network.actor=[256,128,64]", "--steps=64", *SMALL]
+    assert (
+        main([f"--output_dir={tmp_path / 'run'}", *flags, "--walk.balance.height_speed=0.3"]) == 0
+    )
+    found, shipped = (
+        WalkPolicy.load(tmp_path / "run" / LAST).config,
+        load_walk_policy("walk").config,
+    )
+    assert found.gait == shipped.gait
+    assert found.reach == shipped.reach
+    assert found.balance == replace(shipped.balance, height_speed=0.3)
 
 
 def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]):

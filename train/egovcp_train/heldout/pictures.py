@@ -56,6 +56,8 @@ def _block(task: str, report: Mapping[str, Any]) -> str:
     for group, by_horizon in report["state"].items():
         cells = (_pair(e["model"], e["repeat"], 2) for e in by_horizon.values())
         lines.append(_line(group, cells))
+    if (error := report.get("object_rmse_m")) is not None:
+        lines.append(f"object  position {error:.3f} m RMSE")
     return "\n".join(
         [
             *lines,

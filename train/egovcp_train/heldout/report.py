@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -158,17 +159,19 @@ class HeldoutReport(NamedTuple):
     """All measurements."""
 
     metrics: dict[str, float]
-    """Over all tasks: value/r2, value/slope (see `calibration`), latent/kl (nats per row) and
-    latent/active (dimensions of z that carry information)."""
+    """Over all tasks: value/r2, value/slope (see `calibration`), latent/kl (nats per row),
+    latent/active (dimensions of z that carry information) and object_rmse_m (see
+    `TaskMeasurements`)."""
     tasks: dict[str, dict[str, Any]]
-    """Task -> episodes, rows, depth, state, termination, value, latent; JSON-able."""
+    """Task -> episodes, rows, depth, state, termination, value, latent and object_rmse_m, which is
+    None if it is unknown; JSON-able."""
     values: dict[str, Values]
     """Task -> Q and returns, for pictures."""
     strips: dict[str, list[Strip]]
     """Task -> some open-loop predictions, for pictures."""
 
 
-class TaskReport:
+class TaskMeasurements:
     """Measurements of one task, summed over batches of its episodes."""
 
     def __init__(self, stride: int) -> None:
@@ -178,6 +181,9 @@ class TaskReport:
         self.strips: list[Strip] = []
         self.kl = torch.zeros(0)
         """Sum over the rows, of each dimension of z."""
+        self.object_error = self.object_rows = 0.0
+        """Sum of squared distances of the object's decoded from its known position, m^2, and
+        rows; 0 for a model that does not decode it."""
         self._values: list[Values] = []
 
     def add(self, model: WorldModel, batch: Batch, open_loop: bool) -> None:
@@ -192,6 +198,11 @@ class TaskReport:
         usable = batch.valid & batch.mc_valid
         value = model.value(rollout.carry, batch.action)
         self._values.append(Values(value[usable].cpu(), batch.mc_return[usable].cpu()))
+        if model.object_head is not None:
+            known = batch.valid & batch.object_known
+            error = (model.object_position(rollout.carry) - batch.object[..., :3])[known]
+            self.object_error += float(error.double().square().sum())
+            self.object_rows += len(error)
         kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid].double().sum(0).cpu()
         self.kl = kl + self.kl if len(self.kl) else kl
 
@@ -216,7 +227,14 @@ class TaskReport:
                 "share": float((kl > ACTIVE_NATS).double().mean()),
                 "kl_nats": float(kl.sum()),
             },
+            "object_rmse_m": rmse([self]),
         }
+
+
+def rmse(tasks: Sequence[TaskMeasurements]) -> float | None:
+    """Root mean squared error of the object's position over some tasks, m; None: unknown."""
+    rows = sum(task.object_rows for task in tasks)
+    return math.sqrt(sum(task.object_error for task in tasks) / rows) if rows else None
 
 
 @torch.no_grad()
@@ -239,11 +257,11 @@ def measure(
         KeyboardInterrupt: it was stopped before anything was measured.
     """
     model.eval()
-    tasks: dict[str, TaskReport] = {}
+    tasks: dict[str, TaskMeasurements] = {}
     for task, batch, open_loop in episodes:
         if stopped():
             break
-        tasks.setdefault(task, TaskReport(stride)).add(model, batch, open_loop)
+        tasks.setdefault(task, TaskMeasurements(stride)).add(model, batch, open_loop)
     if not tasks:
         if stopped():
             raise KeyboardInterrupt
@@ -257,10 +275,12 @@ def measure(
     )
 
 
-def _over_all_tasks(tasks: list[TaskReport], values: list[Values]) -> dict[str, float]:
+def _over_all_tasks(tasks: list[TaskMeasurements], values: list[Values]) -> dict[str, float]:
     kl = torch.stack([task.kl for task in tasks]).sum(0) / sum(task.rows for task in tasks)
     found = calibration(*(torch.cat(x) for x in zip(*values, strict=True)))
+    error = rmse(tasks)
     return {
+        **({} if error is None else {"object_rmse_m": error}),
         "latent/kl": float(kl.sum()),
         "latent/active": float((kl > ACTIVE_NATS).sum()),
         **{f"value/{name}": v for name in ("r2", "slope") if (v := found[name]) is not None},
@@ -284,4 +304,5 @@ def scalars(tasks: dict[str, dict[str, Any]]) -> dict[str, float]:
         for name in ("slope", "r2", "bias"):
             found[f"{task}/value_{name}"] = report["value"][name]
         found[f"{task}/latent_active"] = report["latent"]["share"]
+        found[f"{task}/object_rmse_m"] = report["object_rmse_m"]
     return {name: value for name, value in found.items() if value is not None}

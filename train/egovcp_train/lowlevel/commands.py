@@ -54,6 +54,21 @@ class Commands:
         """(N, 10) v, hands, height."""
         return np.concatenate([self.velocity, ACTION_BOX.to_metric(self._action)], axis=1)
 
+    @property
+    def standing(self) -> NDArray[np.bool_]:
+        """(N,) robots with zero velocity, commanded and wanted."""
+        return np.asarray(~(self.velocity.any(axis=1) | self._goal.any(axis=1)))
+
+    def keep(self, rows: NDArray[np.intp], seconds: Array) -> None:
+        """No other command for so many seconds (n,)."""
+        self._ticks_left[rows] = (seconds * CONTROLLER_HZ).astype(np.intp) + 1
+
+    def move_hands(self, rows: NDArray[np.intp], target: Array) -> None:
+        """Move hands to ``target`` (n, 6), box units, at the rate limit, and end their random
+        walk until the next command."""
+        self._moves[rows, :HEIGHT] = False
+        self._target[rows, :HEIGHT] = target
+
     def reset(self, rows: NDArray[np.intp]) -> None:
         """New episodes: standing and neutral, with another command within a second."""
         self.velocity[rows] = self._goal[rows] = 0.0

@@ -48,7 +48,7 @@ class CommandConfig:
     """rad/s at the hardest, either way, in a third of the other walking commands."""
     standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), least=0.3, most=1)
     """m, easy and hard."""
-    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), least=0.3, most=1)
+    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.52, 0.75)), least=0.3, most=1)
     """m, easy and hard."""
     acceleration: float = bounded(0.8, least=0.01, most=100)
     """m/s^2 and rad/s^2 at which the commanded velocity changes."""
@@ -71,6 +71,11 @@ class DisturbanceConfig:
     """s between pushes."""
     push: Range = bounded((0.1, 0.8), least=0, most=5)
     """m/s of horizontal velocity at most, easy and hard."""
+    wall: float = bounded(0.5, least=0, most=1)
+    """Share of the pushes of a standing robot that go towards a wall, on which it may brace with
+    its hands; only on the CPU, the mjlab task has no walls."""
+    wall_push: tuple[Range, Range] = bounded(((0.2, 0.4), (0.3, 1.3)), least=0, most=5)
+    """m/s towards the wall, easy and hard."""
     friction: Range = bounded((0.5, 1.1), least=0.01, most=5)
     """Sliding friction of the feet."""
     payload: Range = bounded((-0.5, 2.0), least=-2, most=30)

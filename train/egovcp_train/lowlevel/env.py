@@ -26,6 +26,7 @@ from egovcp_train.lowlevel import physics, rewards, sensing
 from egovcp_train.lowlevel.commands import Commands, random_push
 from egovcp_train.lowlevel.config import LowLevelTask
 from egovcp_train.lowlevel.physics import BatchPhysics, Snapshot
+from egovcp_train.lowlevel.walls import Walls
 
 Array = NDArray[np.float64]
 _RECOVERY_TICKS: Final = 2 * CONTROLLER_HZ  # after a push, in which steps cost nothing
@@ -109,20 +110,21 @@ class TaskLogic:
         self._fresh[rows] = True
 
     def observe(
-        self, x: Snapshot, friction: Array
+        self, x: Snapshot, friction: Array, wall: Array
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Input of the policy (N, 95), and additional input of the critic (N, 16).
+        """Input of the policy (N, 95), and additional input of the critic (N, 17).
 
         Args:
             x: the true state.
             friction: (N,) of the feet.
+            wall: (N,) m to the wall (`Walls.distance`).
         """
         if self._fresh.any():  # as on the robot, the first measurement resets the controller
             rows = None if self._fresh.all() else np.flatnonzero(self._fresh)
             self.walk.reset(self._measure(x), rows)
             self._fresh[:] = False
         seen = self.walk.observe(self._measure(x))
-        return seen, sensing.privileged(x, self._velocity.value, self.walk.height, friction)
+        return seen, sensing.privileged(x, self._velocity.value, self.walk.height, friction, wall)
 
     def _measure(self, x: Snapshot) -> Array:
         return sensing.measure(x, self.commands.vector, self._noise, self.rng)
@@ -149,6 +151,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.physics = BatchPhysics(robots, feet, task.disturbances, threads, seed)
         self.seed, self.rng = seed, np.random.default_rng(seed)
         self.logic = TaskLogic(robots, task, walk, sensors, self.rng)
+        self.walls = Walls(robots, task.disturbances, self.logic.commands, self.rng)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
         self._delay = np.zeros(robots, dtype=np.intp)
         self._next_push = np.zeros(robots, dtype=np.intp)
@@ -156,17 +159,19 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self._observe(self.physics.snapshot())
 
     def get_observations(self) -> TensorDict:
-        """Groups ``policy`` (N, 95) and ``privileged`` (N, 16)."""
+        """Groups ``policy`` (N, 95) and ``privileged`` (N, 17)."""
         return self._observations
 
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One tick of 20 ms."""
+        self.physics.set_walls(self.walls.position, self.walls.yaw)
         self.physics.step(self.logic.targets(actions.detach().numpy()), self._delay)
         self.episode_length_buf += 1
         self._push()
         x = self.physics.snapshot()
+        self.walls.advance(x)
         terms = self.logic.reward_terms(x)
         fallen = self.logic.fallen
         reward = self._weighted(rewards.finite_terms(terms, fallen, x.broken))
@@ -207,6 +212,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         n = len(rows)
         qpos = physics.random_qpos(n, self.rng)
         self.physics.place(rows, qpos, qpos[:, 7:])
+        self.walls.remove(rows)
         self.logic.restart(rows)
         self.episode_length_buf[torch.from_numpy(rows)] = 0
         self._delay[rows] = physics.random_delays(n, self.task.disturbances, self.rng)
@@ -222,9 +228,10 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         rows = np.flatnonzero(self.episode_length_buf.numpy() >= self._next_push)
         if len(rows) == 0:
             return
-        self.physics.qvel[rows, :2] += random_push(
-            len(rows), self.task.disturbances, self.logic.difficulty, self.rng
-        )
+        config, difficulty = self.task.disturbances, self.logic.difficulty
+        at_wall, kick = self.walls.push(rows, self.physics.snapshot(), difficulty)
+        anywhere = random_push(len(rows), config, difficulty, self.rng)
+        self.physics.qvel[rows, :2] += np.where(at_wall[:, None], kick, anywhere)
         self.logic.pushed(rows)
         self._schedule_push(rows)
 
@@ -235,7 +242,9 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         return np.asarray(sum(parts))
 
     def _observe(self, x: Snapshot) -> None:
-        policy, privileged = self.logic.observe(x, self.physics.floor_friction)
+        policy, privileged = self.logic.observe(
+            x, self.physics.floor_friction, self.walls.distance(x)
+        )
         self._observations = TensorDict(
             {"policy": torch.from_numpy(policy), "privileged": torch.from_numpy(privileged)},
             batch_size=[self.num_envs],
@@ -263,8 +272,8 @@ _POLICY_SOURCE: Final = np.concatenate(
 _POLICY_SIGN: Final = np.concatenate(
     [STATE_SIGN, [-1.0, -1.0, 1.0], [1.0, -1.0, -1.0], _ACTION_SIGN]
 )
-_PRIVILEGED_SOURCE: Final = np.array([0, 1, 2, 3, 4, 5, 6, 8, 7, 10, 9, 13, 14, 11, 12, 15])
-_PRIVILEGED_SIGN: Final = np.array([1, -1, 1, -1, -1, 1, 1, 1, 1, 1, 1, 1, -1, 1, -1, 1.0])
+_PRIVILEGED_SOURCE: Final = np.array([0, 1, 2, 3, 4, 5, 6, 8, 7, 10, 9, 13, 14, 11, 12, 15, 16])
+_PRIVILEGED_SIGN: Final = np.array([1, -1, 1, -1, -1, 1, 1, 1, 1, 1, 1, 1, -1, 1, -1, 1, 1.0])
 
 
 def mirrored(

@@ -26,6 +26,7 @@ from egovcp_train.lowlevel.config import CurriculumConfig, DisturbanceConfig, Lo
 from egovcp_train.lowlevel.env import TaskLogic
 from egovcp_train.lowlevel.learner import next_difficulty
 from egovcp_train.lowlevel.physics import HEAD, Snapshot
+from egovcp_train.lowlevel.walls import NO_WALL_DISTANCE
 from egovcp_train.on_policy import RslRlPpoConfig
 
 ROBOT: Final = "robot"  # name in the scene
@@ -73,9 +74,13 @@ class TaskLogicTerm(CommandTerm):
         return self._tensor(self.logic.commands.vector)
 
     def observation(self, which: int) -> torch.Tensor:
-        """0: input of the policy (N, 95); 1: additional input of the critic (N, 16)."""
+        """0: input of the policy (N, 95); 1: additional input of the critic (N, 17)."""
         if self._observations is None:
-            seen = self.logic.observe(self.robot.snapshot(), self.robot.friction())
+            seen = self.logic.observe(
+                self.robot.snapshot(),
+                self.robot.friction(),
+                np.full(self.num_envs, NO_WALL_DISTANCE),
+            )
             self._observations = tuple(self._tensor(part) for part in seen)
         return self._observations[which]
 

@@ -13,12 +13,21 @@ from numpy.typing import NDArray
 from egovcp.robot.mjcf import FootModel, robot_spec
 from egovcp.robot.stance_table import NU, standing_pose
 from egovcp.sim.scene import FLOOR, strip_visuals
+from egovcp.sim.tasks.wall import WALL, add_wall
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, JOINT_NAMES, PHYSICS_DT
 from egovcp_train.lowlevel.config import DisturbanceConfig
 
 Array = NDArray[np.float64]
 HEAD: Final = "head_collision"  # a sphere
+NO_WALL: Final = (1000.0, 0.0, 0.0)
+"""m, position of a wall out of reach."""
+_WALL_FRICTION: Final = (0.5, 1.0)
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CONTROL: Final = int(
+    mujoco.mjtState.mjSTATE_CTRL
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
 #: Sensors of each side: position, velocity and x axis of the foot, position of the palm.
 _SENSORS: Final = (
     ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMEPOS),
@@ -93,7 +102,9 @@ class BatchPhysics:
         steps = self.options.steps_per_tick
         self._states = np.zeros((robots, steps, self.state.shape[1]))
         self._readings = np.zeros((robots, steps, base.nsensordata))
-        self._control = np.zeros((robots, steps, base.nu))
+        self._control = np.zeros((robots, steps, mujoco.mj_stateSize(base, _CONTROL)))
+        self._nu = base.nu
+        self.set_walls(np.tile(np.asarray(NO_WALL), (robots, 1)), np.zeros(robots))
         self._warm = np.zeros((robots, base.nv))
         self._target = np.zeros((robots, base.nu))
         self._previous = np.zeros((robots, base.nu))  # targets of the tick before
@@ -115,6 +126,13 @@ class BatchPhysics:
         self.qpos[rows] = qpos
         self._target[rows] = self._previous[rows] = target
 
+    def set_walls(self, position: Array, yaw: Array) -> None:
+        """Place the walls: position (N, 3) m of the surface, yaw (N,) rad of the normal into it."""
+        self._control[:, :, self._nu : self._nu + 3] = position[:, None]
+        quaternion = self._control[:, :, self._nu + 3 :]
+        quaternion[..., 0] = np.cos(yaw / 2)[:, None]
+        quaternion[..., 3] = np.sin(yaw / 2)[:, None]
+
     def step(self, target: Array, delay: NDArray[np.intp]) -> None:
         """One controller tick.
 
@@ -125,13 +143,14 @@ class BatchPhysics:
         steps = self._control.shape[1]
         for k in range(steps):
             last = np.where((k + steps < delay)[:, None], self._previous, self._target)
-            self._control[:, k] = np.where((k < delay)[:, None], last, target)
+            self._control[:, k, : self._nu] = np.where((k < delay)[:, None], last, target)
         self._previous, self._target = self._target, target.copy()
         self._rollout.rollout(
             self._models,
             self._data,
             self.state,
             self._control,
+            control_spec=_CONTROL,
             skip_checks=True,
             nstep=self._control.shape[1],
             initial_warmstart=self._warm,
@@ -170,7 +189,7 @@ class BatchPhysics:
 
 
 def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> mujoco.MjModel:
-    """The robot on a floor, with the sensors that `BatchPhysics` reads."""
+    """The robot on a floor with a wall, and the sensors that `BatchPhysics` reads."""
     spec = robot_spec(feet)
     (options or PhysicsOptions()).apply(spec)
     strip_visuals(spec)
@@ -179,6 +198,7 @@ def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> muj
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
+    add_wall(spec)
     for name, kind in _SENSORS:
         for side in ("left", "right"):
             on_site = name == "palm"
@@ -221,6 +241,7 @@ def _randomised(
     model.actuator_gainprm[:, 0] *= stiffness
     model.actuator_biasprm[:, 1] *= stiffness
     model.actuator_biasprm[:, 2] *= rng.uniform(*config.damping_scale, model.nu)
+    model.geom(WALL).friction[0] = rng.uniform(*_WALL_FRICTION)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 

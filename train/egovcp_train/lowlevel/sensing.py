@@ -29,7 +29,7 @@ from egovcp_train.lowlevel.physics import Snapshot
 Array = NDArray[np.float64]
 FOCAL: Final = focal_length(CameraConfig().vertical_fov)
 """Pixels per rad at the centre of the depth image."""
-PRIVILEGED_DIM: Final = 2 + 3 + 1 + 1 + 2 + 2 + 4 + 1  # see `privileged`
+PRIVILEGED_DIM: Final = 2 + 3 + 1 + 1 + 2 + 2 + 4 + 1 + 1  # see `privileged`
 SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
 _CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
 _MAX_TORSO_RATE: Final = 20.0  # rad/s, bound for robots whose simulation diverges
@@ -69,11 +69,14 @@ def measure(x: Snapshot, command: Array, std: Array, rng: np.random.Generator) -
     return np.asarray(np.nan_to_num(out, copy=False, posinf=0.0, neginf=0.0))
 
 
-def privileged(x: Snapshot, motion: Array, height: Array, friction: Array) -> NDArray[np.float32]:
-    """Additional input of the critic, (N, 16).
+def privileged(
+    x: Snapshot, motion: Array, height: Array, friction: Array, wall: Array
+) -> NDArray[np.float32]:
+    """Additional input of the critic, (N, 17).
 
     Velocity 2, its average with that of the turning 3, upward velocity 1, height error 1, feet on
-    the floor 2, their heights 2, their positions along and across 4, friction 1.
+    the floor 2, their heights 2, their positions along and across 4, friction 1, distance of a
+    wall 1.
     """
     forward = heading(rotation_matrix(x.quaternion))
     columns = [
@@ -85,6 +88,7 @@ def privileged(x: Snapshot, motion: Array, height: Array, friction: Array) -> ND
         x.feet[..., 2],
         in_heading(x.feet - x.position[:, None], forward).reshape(-1, 4),
         friction[:, None],
+        wall[:, None],
     ]
     out = np.concatenate(columns, axis=1)
     return np.asarray(np.nan_to_num(np.clip(out, -10, 10)), dtype=np.float32)

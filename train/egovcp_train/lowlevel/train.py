@@ -6,7 +6,6 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ import draccus
 import torch
 
 from egovcp.bounds import MAX_PER_CORE, bounded
-from egovcp.cli import run_command, save_config
+from egovcp.cli import given_options, run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import load_walk_policy
@@ -53,8 +52,8 @@ class LowLevelTrainConfig:
     walk: WalkConfig = field(default_factory=WalkConfig)
     """Parts of the controller around the policy: stance law, gait, arms."""
     init: str = ""
-    """Controller whose network the policy starts from: walk (which the package ships) or
-    PATH.safetensors; empty: a new network."""
+    """Controller whose network and parameters (--walk) the policy starts from: walk (which the
+    package ships) or PATH.safetensors; empty: a new network."""
     critic_warmup: int = bounded(0, least=0, most=100_000)
     """Iterations at the start that train the critic alone; for --init."""
     sensors: SensorConfig = field(default_factory=SensorConfig)
@@ -92,8 +91,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         train,
         argv,
         prog=PROG,
-        defaults=partial(resumed_options, LowLevelTrainConfig),
+        defaults=_defaults,
     )
+
+
+def _defaults(argv: Sequence[str]) -> dict[str, Any]:
+    """The options of the run that is resumed, or the parameters of the controller of --init."""
+    resumed = resumed_options(LowLevelTrainConfig, argv)
+    init = given_options(argv).get("init")
+    if resumed or not init:
+        return resumed
+    return {"walk": draccus.encode(load_walk_policy(init).config)}
 
 
 def train(config: LowLevelTrainConfig) -> None:

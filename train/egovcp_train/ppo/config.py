@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
-from egovcp.errors import UsageError, suggest
+from egovcp.errors import UsageError
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
-from egovcp.spec import GAMMA, TASKS
+from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
+from egovcp.spec import GAMMA
 from egovcp_train.on_policy import RslRlPpoConfig
 
 HELD_OUT: Final = 1_000_000_000  # seeds from here on are those of egovcp-eval
-ALL: Final = "all"
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class PpoTrainConfig:
 
     output_dir: str
     """Folder of the run; must not exist unless --resume."""
-    task: str = "ball"
-    """ball, wall, arch, or all in turn."""
+    task: str = DEFAULT_TASK
+    """One of `egovcp-task list`, package.module:Class, several in turn as ball,wall, or all."""
     env: EnvConfig = field(default_factory=EnvConfig)
     """Scenes, sensors, delays and randomisation; the defaults are those of egovcp-collect."""
     network: ReactiveConfig = field(default_factory=ReactiveConfig)
@@ -60,9 +60,7 @@ class PpoTrainConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.task not in (*TASKS, ALL):
-            known = suggest(self.task, (*TASKS, ALL))
-            raise UsageError(f"unknown value --task={self.task}{known}")
+        select_tasks(self.task, training=True)
         if self.seed >= HELD_OUT:
             raise UsageError(
                 f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
@@ -72,4 +70,4 @@ class PpoTrainConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks to learn."""
-        return TASKS if self.task == ALL else (self.task,)
+        return select_tasks(self.task, training=True)

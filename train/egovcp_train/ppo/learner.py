@@ -17,7 +17,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import nn
 
-from egovcp.reactive import KERNELS, STRIDES, FrameStack, Layer, ReactiveConfig, ReactiveNetwork
+from egovcp.reactive import KERNELS, STRIDES, FrameStack, ReactiveConfig, ReactiveNetwork
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.scenario import Scenario
@@ -150,15 +150,13 @@ class ContactLearner(OnPolicyLearner):
         """rsl-rl's actor with its normalisation, in the format of the policy file."""
         actor = self.ppo.get_policy()
         normal = actor.obs_normalizer
-        return ReactiveNetwork(
-            normal.mean,
-            normal.std + normal.eps,
-            _layers(actor.cnns["depth"], nn.Conv2d),
-            _layers(actor.mlp, nn.Linear),
-            self.config.network,
-            self.env.env.controller.id,
-            provenance,
-        )
+        tensors = {
+            "mean": normal.mean,
+            "std": normal.std + normal.eps,
+            **_tensors("cnn", actor.cnns["depth"], nn.Conv2d),
+            **_tensors("mlp", actor.mlp, nn.Linear),
+        }
+        return ReactiveNetwork(tensors, self.config.network, self.env.env.controller.id, provenance)
 
     def state_dict(self) -> dict[str, Any]:
         """Also the number of episodes; after a resume the robots start new ones."""
@@ -170,6 +168,13 @@ class ContactLearner(OnPolicyLearner):
         torch.set_rng_state(state["torch"])
 
 
-def _layers(module: nn.Module, kind: type[nn.Conv2d | nn.Linear]) -> tuple[Layer, ...]:
-    found = [dict(m.named_parameters()) for m in module.children() if isinstance(m, kind)]
-    return tuple((x["weight"].detach().clone(), x["bias"].detach().clone()) for x in found)
+def _tensors(
+    part: str, module: nn.Module, kind: type[nn.Conv2d | nn.Linear]
+) -> dict[str, torch.Tensor]:
+    """``PART.I.weight`` and ``PART.I.bias`` of the layers of this kind."""
+    layers = [m for m in module.children() if isinstance(m, kind)]
+    return {
+        f"{part}.{i}.{name}": parameter.detach().clone()
+        for i, layer in enumerate(layers)
+        for name, parameter in layer.named_parameters()
+    }

@@ -41,7 +41,6 @@ from egovcp_deploy.robots.zmq_camera import DepthFrame, encode_frame
 WATCHDOG_S: Final = 0.2
 MODE: Final = 5  # the fake's mode machine
 _MOTOR_DEG_C: Final = 35.0
-_SOURCE_TIMEOUT_S: Final = 0.5  # since its last command a program no longer counts as a source
 _MAX_COMMANDS: Final = 100  # received per step
 
 
@@ -63,8 +62,7 @@ class Ports:
 class CommandCounters:
     """Received messages on the command port."""
 
-    commands: int = 0
-    """Applied, or replaced by a newer command within the same step."""
+    commands: int = 0  # applied, or replaced by a newer command within the same step
     malformed: int = 0
     ignored: int = 0
     """For another mode machine, or with ankles and waist commanded motor by motor; a G1 ignores
@@ -72,25 +70,17 @@ class CommandCounters:
 
 
 class FakeBridge:
-    """Serves one `LiveRobot`.
+    """Serves one `LiveRobot` that is in an episode; raises `EnvironmentFailure` if a port is in
+    use.
 
-    Args:
-        robot: in an episode (`LiveRobot.start`).
-        ports: where to listen.
-        announce: whether states report how many programs send commands, which LeRobot's bridge
-            does not.
-        detailed: whether states have casing and winding temperatures, status and lost packets of
-            each motor; LeRobot's bridge sends one temperature and no status.
-
-    Raises:
-        EnvironmentFailure: a port is in use.
+    If ``detailed``, states have casing and winding temperatures and status of each motor; LeRobot's
+    bridge sends one temperature and no status.
     """
 
     def __init__(
         self,
         robot: LiveRobot,
         ports: Ports | None = None,
-        announce: bool = False,
         detailed: bool = False,
     ) -> None:
         self.robot = robot
@@ -104,10 +94,8 @@ class FakeBridge:
         self.on_command: Callable[[bytes], None] = lambda message: None
         """Called with every message on the command port."""
         self.counters = CommandCounters()
-        self._announce = announce
         self._detailed = detailed
         self._rng = np.random.default_rng(0)
-        self._sources: dict[int, float] = {}  # connection -> time of its last command
         self._time = 0.0  # s of simulated time since the start
         self._last_command = -np.inf
         self._servos = DAMPED
@@ -157,12 +145,10 @@ class FakeBridge:
         waiting: list[bytes] = []
         while len(waiting) < _MAX_COMMANDS:
             try:
-                frame = self._commands.recv(zmq.NOBLOCK, copy=False)
+                waiting.append(self._commands.recv(zmq.NOBLOCK))
             except zmq.Again:
                 break
-            self._sources[int(frame.get(zmq.SRCFD))] = self._time
-            waiting.append(frame.bytes)
-            self.on_command(frame.bytes)
+            self.on_command(waiting[-1])
         while waiting and not self.faults.ignore_commands:
             if self._accept(waiting.pop()):
                 self.counters.commands += len(waiting)
@@ -226,11 +212,10 @@ class FakeBridge:
         readings = MotorReadings(torque, temperature)
         if not self._detailed:
             return readings
-        status, lost = np.zeros(NUM_JOINTS, np.int64), np.zeros(NUM_JOINTS, np.int64)
+        status = np.zeros(NUM_JOINTS, np.int64)
         if faults.dropped_motor is not None:
             status[faults.dropped_motor] = DISCONNECTED
-            lost[faults.dropped_motor] = self.robot.steps
-        return replace(readings, faults=status, lost=lost, enabled=status == 0)
+        return replace(readings, faults=status, enabled=status == 0)
 
     def _publish_state(self) -> None:
         faults = self.faults
@@ -260,16 +245,8 @@ class FakeBridge:
             mode=self._mode,
             remote=remote.to_bytes(),
             motors=self._motors(measured.torque),
-            command_sources=self._command_sources(),
         )
         return encode_state(state, measured.acceleration)
-
-    def _command_sources(self) -> int | None:
-        """How many programs send commands."""
-        if not (self._announce or self.faults.report_extra_publisher):
-            return None
-        recent = sum(self._time - last < _SOURCE_TIMEOUT_S for last in self._sources.values())
-        return recent + self.faults.report_extra_publisher
 
     def _publish_image(self) -> None:
         step, depth = self.robot.depth_image

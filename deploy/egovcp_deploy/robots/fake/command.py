@@ -16,17 +16,18 @@ from egovcp.errors import UsageError
 from egovcp.outputs import output_file, write_report
 from egovcp.rate import NS_PER_S, Clock, MonotonicClock
 from egovcp.sim.config import EnvConfig, evaluation_config
-from egovcp.sim.live import EpisodeOutcome, LiveRobot
+from egovcp.sim.live import EpisodeOutcome, LiveRobot, Phase
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
 from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
 from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
+MIN_PAUSE: Final = 1.5  # s: in HOLD the robot takes 1 s to return to its neutral pose
 _MAX_STEPS: Final = 20  # caught up after a delay; the rest are dropped
 _EPILOG: Final = (
     "Motors use LeRobot's JSON over ZMQ, depth the format of egovcp-depth-server. Without a "
@@ -46,8 +47,8 @@ class FakeG1Config:
     time limit.
     """
 
-    task: str = "ball"
-    """Scene: ball, wall, arch, or sequence (several in one episode, --env.sequence.parts)."""
+    task: str = DEFAULT_TASK
+    """Scene: one of `egovcp-task list`, or package.module:Class."""
     seed: int = bounded(0, least=0)
     """Seed of the held-out scenarios, as in egovcp-eval."""
     episode: int = bounded(0, least=0)
@@ -64,16 +65,14 @@ class FakeG1Config:
     1.5."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
-    announce: bool = False
-    """Report in every state how many programs send commands, which LeRobot's bridge does not."""
     detailed: bool = False
-    """Report casing and winding temperatures, status and lost packets of each motor in every state;
-    LeRobot's bridge sends one temperature and no status."""
+    """Report casing and winding temperatures and status of each motor in every state; LeRobot's
+    bridge sends one temperature and no status."""
     json: str = output_file()
     """File for the outcomes, rewritten after each episode."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation. The controller only selects the pose to stand in
-    and whether the arch comes to the robot; the delay of actions is that of the connection."""
+    and whether the robot can walk; the delay of actions is that of the connection."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -82,16 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(config: FakeG1Config, opened: Callable[[Ports], None] = lambda ports: None) -> None:
-    """Serve until the episodes are over or the user ends it.
-
-    Args:
-        config: the options.
-        opened: called with the ports once the robot listens.
-
-    Raises:
-        UsageError: an option is invalid.
-        EnvironmentFailure: a port is in use.
-    """
+    """Serve until the episodes are over or the user ends it; ``opened`` is called with the ports
+    once the robot listens. Raises `EnvironmentFailure` if a port is in use."""
     first = held_out(config.task, config.seed, config.episode)
     robot = LiveRobot(config.env)
     robot.start(first)
@@ -101,9 +92,10 @@ def run(config: FakeG1Config, opened: Callable[[Ports], None] = lambda ports: No
             return None
         return held_out(config.task, config.seed, config.episode + number)
 
-    bridge = FakeBridge(robot, config.ports, announce=config.announce, detailed=config.detailed)
-    schedule = EpisodeSchedule(config.gantry, config.settle, config.pause)
-    episodes = EpisodeSequencer(bridge, scenario, schedule, _print)
+    bridge = FakeBridge(robot, config.ports, detailed=config.detailed)
+    episodes = EpisodeSequencer(
+        bridge, scenario, _print, config.gantry, config.settle, config.pause
+    )
     try:
         opened(bridge.ports)
         _serve(config, bridge, episodes)
@@ -135,6 +127,110 @@ def _serve(config: FakeG1Config, bridge: FakeBridge, episodes: EpisodeSequencer)
             written = len(episodes.outcomes)
             report = [outcome_json(outcome) for outcome in episodes.outcomes]
             write_report(config.json, report, durable=False)  # an fsync would delay the robot
+
+
+#: Buttons that are pressed in each phase after the first episode.
+_HOLD: Final = frozenset({"B"})
+_RUN: Final = frozenset({"start"})
+_BUTTONS: Final = {
+    Phase.OVER: _HOLD,
+    Phase.HELD: _HOLD,
+    Phase.FREE: _RUN,
+    Phase.EPISODE: frozenset[str](),
+}
+
+
+class EpisodeSequencer:
+    """Plays one scenario after another.
+
+    Between two episodes it presses the buttons of the remote control as an operator would, because
+    a robot must not be lifted or put down while a planner moves it. The first start is left to the
+    operator.
+
+    Args:
+        robot: advanced by `step`.
+        scenarios: number of an episode -> its scenario; None: there are no more.
+        log: called with a line for every change of phase.
+        gantry: time for which the motors must hold a pose before the gantry releases the robot, s
+            of simulated time; None: it waits for `LiveRobot.release`.
+        settle: from there to the beginning of the task, s.
+        pause: from the end of an episode to the next, s, at least `MIN_PAUSE`.
+    """
+
+    def __init__(
+        self,
+        robot: FakeBridge,
+        scenarios: Callable[[int], Scenario | None],
+        log: Callable[[str], None] = lambda line: None,
+        gantry: float | None = 3.0,
+        settle: float = 2.0,
+        pause: float = 2.0,
+    ) -> None:
+        self._robot = robot
+        self._scenarios = scenarios
+        self._log = log
+        self._gantry, self._settle, self._pause = gantry, settle, max(MIN_PAUSE, pause)
+        self.outcomes: list[EpisodeOutcome] = []
+        """Outcomes of the finished episodes."""
+        self.finished = False
+        """Whether there are no more episodes."""
+        self._start()
+
+    def _start(self) -> None:
+        scenario = self._scenarios(len(self.outcomes))
+        if scenario is None:
+            self.finished = True
+            return
+        self._robot.robot.start(scenario)
+        self._robot.next_episode()
+        self._enter(Phase.HELD)
+        self._log(f"episode {scenario.episode} ({scenario.task}): on the gantry")
+
+    def _enter(self, phase: Phase) -> None:
+        self._phase, self._since = phase, 0.0
+        if self.outcomes or phase is Phase.OVER:
+            self._robot.pressed = _BUTTONS[phase]
+
+    def step(self) -> None:
+        """Advance by 5 ms."""
+        if self.finished:
+            return
+        self._robot.step()
+        robot = self._robot.robot
+        if robot.phase is not self._phase:
+            self._enter(robot.phase)
+            self._report()
+        self._since += PHYSICS_DT
+        if self._phase is Phase.HELD:
+            if not self._robot.commanded:
+                self._since = 0.0
+            elif self._gantry is not None and self._since > self._gantry:
+                robot.release()
+        elif self._phase is Phase.FREE and self._since >= self._settle:
+            robot.begin()
+        elif self._phase is Phase.OVER and self._since >= self._pause:
+            self._start()
+
+    def _report(self) -> None:
+        if self._phase is Phase.FREE:
+            self._log("the gantry releases the robot")
+        elif self._phase is Phase.EPISODE:
+            self._log("the task begins")
+        elif self._phase is Phase.OVER:
+            outcome = self._robot.robot.outcome
+            self.outcomes.append(outcome)
+            self._log(outcome_text(outcome))
+
+
+def outcome_text(outcome: EpisodeOutcome) -> str:
+    """Describe an outcome in one line."""
+    result = "fell" if outcome.fallen else "success" if outcome.success else "failure"
+    terms = ", ".join(f"{k} {v:+.3f}" for k, v in outcome.reward_terms.items() if v)
+    contacts = ", ".join(f"{part} {force:.0f} N" for part, force in outcome.contacts.items())
+    return (
+        f"{result} after {outcome.ticks} ticks, reward {outcome.reward:+.3f} "
+        f"({terms or 'no terms'}); contacts: {contacts or 'none'}"
+    )
 
 
 class StepPacer:

@@ -17,36 +17,23 @@ _HOT: Final = 125.0  # deg C
 class InjectedFaults:
     """Faults of the fake G1, all off by default. May be changed at any time."""
 
-    freeze_state: bool = False
-    """Repeat the last state, like a hung driver."""
-    stop_state: bool = False
-    """Send no states."""
-    truncate_state: bool = False
-    """Cut every second state in half."""
-    freeze_camera: bool = False
-    """Repeat the last image."""
-    stop_camera: bool = False
-    """Send no images."""
-    drop: float = 0.0
-    """Share of states and images that are lost."""
-    ignore_commands: bool = False
-    """Receive commands without executing them."""
-    report_extra_publisher: bool = False
-    """Report one more program that sends commands."""
-    other_publisher: bool = False
-    """Another program holds every joint where it is, without being reported."""
-    mode: int | None = None
-    """Report this value of Unitree's `mode_machine` field."""
+    freeze_state: bool = False  # repeat the last state, like a hung driver
+    stop_state: bool = False  # send no states
+    truncate_state: bool = False  # cut every second state in half
+    freeze_camera: bool = False  # repeat the last image
+    stop_camera: bool = False  # send no images
+    drop: float = 0.0  # share of states and images that are lost
+    ignore_commands: bool = False  # receive commands without executing them
+    other_publisher: bool = False  # another program holds every joint where it is
+    mode: int | None = None  # report this value of Unitree's `mode_machine` field
     hot_motor: tuple[int, float] | None = None
     """Joint whose motor reports this temperature, deg C (of its winding, if it reports two)."""
     dropped_motor: int | None = None
     """Joint whose motor gives no torque. Only detailed states report it."""
     push: tuple[float, ...] | None = None
     """Change of the base's velocity, m/s, world x and y; happens once."""
-    release: bool = False
-    """The gantry releases the robot, once."""
-    crash: bool = False
-    """The process ends at once, without sending anything."""
+    release: bool = False  # the gantry releases the robot, once
+    crash: bool = False  # the process ends at once, without sending anything
 
     @property
     def active(self) -> list[str]:
@@ -54,11 +41,8 @@ class InjectedFaults:
         return [f.name for f in fields(self) if getattr(self, f.name) != f.default]
 
     def apply(self, line: str) -> str:
-        """Execute a line of the console; returns the answer. An empty line is ``release``.
-
-        Raises:
-            UsageError: the line is not a known command.
-        """
+        """Execute a line of the console and return the answer; an empty line is ``release``. Raises
+        `UsageError` if it is not a known command."""
         word, *rest = line.split() or ["release"]
         if word not in FAULT_COMMANDS:
             raise UsageError(f"unknown {word!r}{suggest(word, FAULT_COMMANDS)}")

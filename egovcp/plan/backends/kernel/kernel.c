@@ -77,7 +77,7 @@ static float mean_of_bins(const Readout *as, const float *outputs) {
         Floats weight = exponential(load(outputs + i) - most);
         if (as->bins - i < LANES) weight = first_floats(weight, as->bins - i);
         weights += weight;
-        sum = fused(weight, load(as->each + i), sum);
+        sum = fused(weight, load(as->bin_values + i), sum);
     }
     return total(sum) / total(weights);
 }
@@ -149,15 +149,15 @@ void layout(int32_t *depth, int32_t *lanes, int32_t *group) {
 typedef struct {
     const Network *net;
     const SharedPrefix *prefix;
-    int32_t rows, steps;
-    const float *actions; /* [rows][steps][actions] */
+    int32_t plans, steps;
+    const float *actions; /* [plans][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
-    float *values;        /* [rows] J */
+    float *values;        /* [plans] J */
     ThreadPool pool;
 } Job;
 
 /* J of a plan, as in `ReturnAccumulator`, from row r of the results of `block` and the row's actions. */
-static float sum_of(const Job *job, int r, const float *values, const float *logits,
+static float plan_value(const Job *job, int r, const float *values, const float *logits,
                     const float *actions) {
     const Readout *as = &job->net->readout;
     const float base = as->rule == PAPER ? 0.0f : as->floor;
@@ -180,7 +180,7 @@ static float sum_of(const Job *job, int r, const float *values, const float *log
 /* Evaluates a block of candidates from `row` on; rows beyond the last repeat the first. */
 static void evaluate_block(const Job *job, int row) {
     const int steps = job->steps, per_row = steps * job->net->actions;
-    const int count = row + ROWS <= job->rows ? ROWS : job->rows - row;
+    const int count = row + ROWS <= job->plans ? ROWS : job->plans - row;
     const float *actions = job->actions + (int64_t)row * per_row;
     float padded[ROWS * per_row], values[steps * ROWS], logits[steps * ROWS];
     if (count < ROWS) {
@@ -190,12 +190,12 @@ static void evaluate_block(const Job *job, int row) {
     }
     block(job->net, job->prefix, steps, actions, job->noise, values, logits);
     for (int r = 0; r < count; r++)
-        job->values[row + r] = sum_of(job, r, values, logits, actions + r * per_row);
+        job->values[row + r] = plan_value(job, r, values, logits, actions + r * per_row);
 }
 
 static void evaluate_blocks(Job *job) {
     take_tiles();
-    for (int row; (row = __atomic_fetch_add(&job->pool.next, ROWS, __ATOMIC_RELAXED)) < job->rows;)
+    for (int row; (row = __atomic_fetch_add(&job->pool.next, ROWS, __ATOMIC_RELAXED)) < job->plans;)
         evaluate_block(job, row);
     release_tiles();
 }
@@ -211,14 +211,14 @@ void evaluate(Job *job) {
 void work(Job *job) {
     for (int32_t turn = 0; (turn = wait_for_job(&job->pool, turn));) {
         evaluate_blocks(job);
-        change(&job->pool.active, -1);
+        add_atomic(&job->pool.active, -1);
     }
-    change(&job->pool.workers, -1);
+    add_atomic(&job->pool.workers, -1);
 }
 
 /* Number of workers to start, so that there are `wanted`. */
 int32_t missing_workers(Job *job, int32_t wanted) {
-    const int32_t count = wanted - look(&job->pool.workers);
-    change(&job->pool.workers, count);
+    const int32_t count = wanted - load_atomic(&job->pool.workers);
+    add_atomic(&job->pool.workers, count);
     return count;
 }

@@ -59,7 +59,7 @@ typedef struct { /* conversion of the outputs of the heads to J */
     int32_t objective; /* an `Objective` */
     int32_t rule;      /* a `Rule` */
     int32_t bins;      /* of the distribution whose logits are the outputs of Q; 0: Q is the one output */
-    const float *each; /* [bins padded to 16] their values */
+    const float *bin_values; /* [bins padded to 16] */
     float mean, std, floor, threshold, discount;
 } Readout;
 

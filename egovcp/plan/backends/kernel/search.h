@@ -46,13 +46,13 @@ void walk(int32_t robots, int32_t plans, int32_t steps, int32_t size, float eta,
 }
 
 /* Indices of the `count` largest of values [plans], best first; of equal ones, the earlier. */
-static void best(const float *values, int32_t plans, int32_t count, int32_t *place) {
+static void top_indices(const float *values, int32_t plans, int32_t count, int32_t *index) {
     int known = 0;
     for (int i = 0; i < plans; i++) {
-        if (known == count && !(values[i] > values[place[count - 1]])) continue;
+        if (known == count && !(values[i] > values[index[count - 1]])) continue;
         int at = known < count ? known++ : count - 1;
-        for (; at > 0 && values[i] > values[place[at - 1]]; at--) place[at] = place[at - 1];
-        place[at] = i;
+        for (; at > 0 && values[i] > values[index[at - 1]]; at--) index[at] = index[at - 1];
+        index[at] = i;
     }
 }
 
@@ -81,13 +81,13 @@ static void moments(const float *elites, int32_t count, int32_t size, float leas
 void update(int32_t robots, int32_t plans, int32_t size, int32_t count, float least, const float *deltas,
            const float *values, float *elites, float *top, float *value, float *mean, float *std) {
     for (int e = 0; e < robots; e++) {
-        int32_t place[count];
+        int32_t index[count];
         int usable = 0;
         float sum = 0.0f;
-        best(values, plans, count, place);
+        top_indices(values, plans, count, index);
         for (int i = 0; i < count; i++) {
-            memcpy(elites + i * size, deltas + (int64_t)place[i] * size, size * sizeof(float));
-            top[i] = values[place[i]];
+            memcpy(elites + i * size, deltas + (int64_t)index[i] * size, size * sizeof(float));
+            top[i] = values[index[i]];
             if (top[i] > -INFINITY) sum += top[i], usable++;
         }
         value[e] = usable ? sum / (float)usable : -INFINITY;

@@ -1,0 +1,123 @@
+"""`egovcp-dataset delete` and `split`: some episodes of a dataset as new datasets."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from egovcp.bounds import bounded
+from egovcp.checks.lerobot_dataset import LeRobotCheck
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
+from egovcp.data.lerobot import LeRobotReader, is_own
+from egovcp.data.source import locate, select_episodes
+from egovcp.errors import UsageError
+from egovcp.outputs import output_file, write_report
+from egovcp.terminal import echo, echo_lines
+from egovcp_collect.dataset.rewrite import new_folder
+from egovcp_collect.dataset.subset import write_subset
+
+
+@dataclass(frozen=True)
+class DeleteConfig:
+    """Write a dataset without some episodes to a new folder; the old one is not changed.
+
+    Works on LeRobot v3 datasets of any features. Videos are copied, not encoded again."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset: a folder, or an id of the Hub."""
+    episodes: str = ""
+    """The episodes to leave out: numbers, `[0, 5, 7]`, a range whose end is excluded, `0:1334`, or
+    both, `[0:100, 250]`."""
+    output_dir: str = ""
+    """Folder of the new dataset."""
+    json: str = output_file()
+    """File for the result: {"episodes", "frames"}; empty: none."""
+
+
+@dataclass(frozen=True)
+class SplitConfig:
+    """Split a dataset at random into several new ones; the old one is not changed.
+
+    Works on LeRobot v3 datasets of any features. Videos are copied, not encoded again."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset: a folder, or an id of the Hub."""
+    splits: dict[str, float] = field(default_factory=lambda: {"train": 0.9, "test": 0.1})
+    """Name of each new dataset: its share of the episodes."""
+    seed: int = bounded(0, least=0)
+    """Seed of the random choice."""
+    output_dir: str = ""
+    """Folder of the new datasets, each in a folder with its name."""
+    json: str = output_file()
+    """File for the result: {NAME: {"episodes", "frames"}}; empty: none."""
+
+
+def run_delete(config: DeleteConfig) -> None:
+    """Write the new dataset."""
+    root = locate(config.dataset).root
+    count = _count(root)
+    if not config.episodes:
+        raise UsageError("which episodes shall be left out? give --episodes='[3, 7]'")
+    left_out = select_episodes(config.episodes, count, "--episodes").tolist()
+    kept = sorted(set(range(count)) - set(left_out))
+    if not kept:
+        raise UsageError(f"--episodes={config.episodes} leaves no episode of {count}")
+    write_report(config.json, _write(root, kept, config.output_dir))
+
+
+def run_split(config: SplitConfig) -> None:
+    """Write the new datasets."""
+    root = locate(config.dataset).root
+    count, total = _count(root), sum(config.splits.values())
+    names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
+    shares = all(0 < share <= 1 for share in config.splits.values())
+    if not (config.splits and names and shares and total <= 1 + 1e-9):
+        raise UsageError(
+            f"--splits={config.splits}: expected names of folders with shares that add up to 1 or "
+            "less, such as {train: 0.9, test: 0.1}"
+        )
+    order = np.random.default_rng(config.seed).permutation(count)
+    result, first, share = {}, 0, 0.0
+    for name, part in config.splits.items():
+        share += part
+        end = math.floor(share * count + 0.5)
+        if end <= first:
+            raise UsageError(f"--splits: {name} would have none of the {count} episodes")
+        kept = sorted(order[first:end].tolist())
+        output = str(Path(config.output_dir) / name) if config.output_dir else ""
+        result[name], first = _write(root, kept, output), end
+    write_report(config.json, result)
+
+
+def _count(root: Path) -> int:
+    """Number of episodes of a dataset with sound tables; prints what will not be checked."""
+    if is_own(root):
+        return len(DatasetReader.open(_folder(root)))
+    reader = LeRobotReader.open(root)
+    echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
+    return len(reader.rows)
+
+
+def _folder(root: Path) -> DatasetConfig:
+    return DatasetConfig(root=str(root))
+
+
+def _write(root: Path, kept: Sequence[int], output_dir: str) -> dict[str, int]:
+    """Write the episodes to the new dataset ``output_dir``."""
+    output = new_folder(output_dir, [root])
+    if is_own(root):
+        reader = DatasetReader.open(_folder(root))
+        with DatasetWriter(output, reader.origin) as writer:
+            for index in tqdm(kept, unit="ep", delay=1):
+                writer.add(reader.read(index))
+        episodes, frames = len(kept), writer.num_frames
+    else:
+        episodes, frames = write_subset(LeRobotReader.open(root), kept, output)
+    echo(f"{output}: {episodes} episodes, {frames} frames")
+    return {"episodes": episodes, "frames": frames}

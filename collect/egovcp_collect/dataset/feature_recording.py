@@ -1,0 +1,93 @@
+"""An episode of a LeRobot v3 dataset of any features as a Rerun recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
+from egovcp.data.pictures import decode_frames, decode_image
+from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.files import removed_on_error
+from egovcp.packages import require_packages
+
+
+def record_features(reader: LeRobotReader, row: EpisodeRow, output: Path) -> list[str]:
+    """Write an episode as the new recording ``output``; returns the features that it shows.
+
+    Raises:
+        DataError: the episode is damaged.
+        EnvironmentFailure: ``output`` exists.
+    """
+    if output.exists():
+        raise EnvironmentFailure(f"{output} exists already; choose another --output, or remove it")
+    features = {k: f for k, f in reader.features.items() if f.is_camera or f in reader.numeric}
+    if reader.keys("video"):
+        require_packages("egovcp", "a dataset with videos", "av")
+    table = reader.read(row, [*(k for k, f in features.items() if f.dtype != "video"), "timestamp"])
+    times = values_of(table["timestamp"], reader.features["timestamp"])[:, 0].astype(np.float64)
+    stream = rr.RecordingStream("egovcp", recording_id=f"{reader.root.name} episode {row.index}")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with removed_on_error(output):
+        stream.save(output)
+        for key, feature in features.items():
+            if feature.is_camera:
+                _log_camera(stream, feature, _images(row, feature, table, times), times)
+            else:
+                _log_values(stream, feature, values_of(table[key], feature), times)
+        stream.flush(timeout_sec=60.0)
+        stream.disconnect()
+    return [*features]
+
+
+def _columns(times: NDArray[np.float64]) -> list[Any]:
+    return [
+        rr.TimeColumn("frame", sequence=np.arange(len(times))),
+        rr.TimeColumn("time", duration=times),
+    ]
+
+
+def _log_values(
+    stream: rr.RecordingStream, feature: Feature, values: NDArray[Any], times: NDArray[np.float64]
+) -> None:
+    path = feature.key.replace(".", "/")
+    names = [feature.label(i).removeprefix(feature.key) for i in range(feature.size)]
+    stream.log(path, rr.SeriesLines(names=[name.strip() or path for name in names]), static=True)
+    scalars = rr.Scalars.columns(scalars=values.astype(np.float64))
+    stream.send_columns(path, _columns(times), scalars)
+
+
+def _images(
+    row: EpisodeRow, feature: Feature, table: pa.Table, times: NDArray[np.float64]
+) -> Iterator[NDArray[Any]]:
+    """The images of a camera, (H, W) or (H, W, 3)."""
+    if feature.dtype == "video":
+        span = row.videos[feature.key]
+        layout = "gray16le" if feature.is_depth else "rgb24"
+        for frame in decode_frames(span.path, span.start_s + times):
+            yield frame.to_ndarray(format=layout)
+        return
+    for number, content in enumerate(table[feature.key]):
+        yield np.asarray(decode_image(content.as_py(), number, feature.key))
+
+
+def _log_camera(
+    stream: rr.RecordingStream,
+    feature: Feature,
+    images: Iterator[NDArray[Any]],
+    times: NDArray[np.float64],
+) -> None:
+    number = -1
+    for number, image in enumerate(images):
+        stream.set_time("frame", sequence=number)
+        stream.set_time("time", duration=float(times[number]))
+        shown = rr.DepthImage(image) if feature.is_depth else rr.Image(image).compress(90)
+        stream.log(feature.key.replace(".", "/"), shown)
+    if number + 1 < len(times):
+        raise DataError(f"{feature.key} ends after {number + 1} of {len(times)} frames")

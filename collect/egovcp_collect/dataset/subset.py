@@ -1,0 +1,343 @@
+"""Writes episodes of a LeRobot v3 dataset of any features to a new dataset.
+
+Rows are copied, with new episode and frame indices. Video files are copied whole, because a video
+may hold more than the dataset shows; nothing is encoded again.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from egovcp.checks.feature_statistics import Statistics, aggregate, describe
+from egovcp.checks.lerobot_dataset import LeRobotCheck
+from egovcp.data import files, schema
+from egovcp.data.destination import writer_lock
+from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, VideoSpan
+from egovcp.data.paths import files_below
+from egovcp.data.pictures import decode_frames, decode_image, frame_times
+from egovcp.data.stats import QUANTILES
+from egovcp.data.writer import publish_version
+from egovcp.errors import DataError
+
+_SAMPLED_FRAMES: Final = 20  # for the statistics of a camera that are not recorded
+
+
+@dataclass(frozen=True)
+class SoundEpisode:
+    """An episode without a problem."""
+
+    row: EpisodeRow
+    table: pa.Table
+    """Its rows, with all columns."""
+    values: dict[str, NDArray[Any]]
+    """Its numbers and strings, (T, n) of each feature."""
+
+
+class EpisodeScan:
+    """Reads the episodes of a dataset, whose tables may be damaged, from its data files.
+
+    What the tables lack is taken from the data: tasks from the episodes that name one task, and the
+    place of an episode in the videos if these hold the frames of all episodes and no others.
+    """
+
+    def __init__(self, reader: LeRobotReader) -> None:
+        self.reader = reader
+        self._check = LeRobotCheck(reader, every=True)
+        self._columns = [k for k, f in reader.features.items() if f.dtype != "video"]
+        self._spans = _rebuilt_spans(reader)
+        if not reader.tasks:
+            reader.tasks = self._named_tasks()
+
+    def __iter__(self) -> Iterator[SoundEpisode | DataError]:
+        """Each sound episode once, in order; the problems of the others."""
+        seen = set[int]()
+        for path in self.reader.data_files:
+            for part in self.reader.episodes(path, self._columns):
+                if isinstance(part, DataError):
+                    yield part
+                    seen |= {part.episode} if part.episode is not None else set()
+                    continue
+                number, table = part
+                if number in seen:
+                    problem = "an earlier episode has the same episode_index"
+                    yield DataError.at(path, problem, number)
+                    continue
+                seen.add(number)
+                yield from self._examine(path, number, table)
+        for row in self.reader.rows:
+            if row.index not in seen:
+                seen.add(row.index)
+                yield DataError.at(row.data, "its rows cannot be read", row.index)
+
+    def _examine(
+        self, path: Path, number: int, table: pa.Table
+    ) -> Iterator[SoundEpisode | DataError]:
+        row = self._check.by_number.get(number) or EpisodeRow(path, number, 0, 0, 0, path)
+        spans = self._spans.get(number, row.videos)
+        videos = self.reader.keys("video")
+        if missing := sorted(set(videos) - set(spans)):
+            problem = "meta/episodes does not list it, and the videos do not tell where it is"
+            yield DataError.at(path, f"{problem} in {missing[0]}", number)
+            return
+        row = replace(row, videos=spans)
+        self._check.by_number[number] = row
+        for found in self._check.episode_problems(path, number, table):
+            if isinstance(found, DataError):
+                yield found
+            else:
+                yield SoundEpisode(replace(row, data=path), table, found)
+
+    def _named_tasks(self) -> dict[int, str]:
+        """Task index -> task, from the episodes that name one."""
+        named = {row.index: row.tasks[0] for row in self.reader.rows if len(row.tasks) == 1}
+        tasks: dict[int, str] = {}
+        for path in self.reader.data_files:
+            for part in self.reader.episodes(path, ["task_index"]):
+                if not isinstance(part, DataError) and part[0] in named and len(part[1]):
+                    tasks.setdefault(part[1]["task_index"][0].as_py(), named[part[0]])
+        return tasks
+
+
+def _rebuilt_spans(reader: LeRobotReader) -> dict[int, dict[str, VideoSpan]]:
+    """Episode -> where each video shows it, if the video files, in order, hold all episodes one
+    after another; of other cameras nothing."""
+    lengths: dict[int, int] = {}
+    spans: dict[int, dict[str, VideoSpan]] = {}
+    videos = reader.keys("video")
+    for path in reader.data_files if videos else ():
+        for part in reader.episodes(path, ["episode_index"]):
+            if not isinstance(part, DataError):
+                lengths[part[0]] = lengths.get(part[0], 0) + len(part[1])
+    for key in videos:
+        waiting = list(lengths.items())
+        placed: dict[int, VideoSpan] = {}
+        try:
+            for path in files_below(reader.root / "videos" / key):
+                times, used = frame_times(path), 0
+                while waiting and used + waiting[0][1] <= len(times):
+                    number, length = waiting.pop(0)
+                    placed[number] = VideoSpan(path, float(times[used]))
+                    used += length
+                if used != len(times):
+                    raise DataError.at(path, "holds other frames")
+        except DataError:
+            continue
+        if not waiting:
+            for number, span in placed.items():
+                spans.setdefault(number, {})[key] = span
+    return {n: found for n, found in spans.items() if len(found) == len(videos)}
+
+
+@contextmanager
+def new_dataset(root: Path) -> Iterator[Path]:
+    """A folder that becomes the new dataset ``root`` at the end of the block, unless it raises."""
+    work = root.with_name(f".{root.name}.new")
+    work.mkdir(parents=True, exist_ok=True)
+    folder = work / "dataset"
+    with writer_lock(root, work):
+        shutil.rmtree(folder, ignore_errors=True)  # of a killed command
+        try:
+            yield folder
+            files.sync_tree(folder)
+            publish_version(folder, root)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+class SubsetWriter:
+    """Writes sound episodes, in the order of the data files of their dataset, to the new folder
+    ``folder``; call `finish` at the end."""
+
+    def __init__(self, reader: LeRobotReader, folder: Path) -> None:
+        self._reader, self._folder = reader, folder
+        self._source: Path | None = None
+        self._writer: pq.ParquetWriter | None = None
+        self._files = 0
+        self._rows: list[dict[str, Any]] = []
+        self._stats: dict[str, list[tuple[int, Statistics]]] = {}
+        self.num_frames = 0
+
+    @property
+    def num_episodes(self) -> int:
+        return len(self._rows)
+
+    def add(self, episode: SoundEpisode) -> None:
+        """Append an episode."""
+        number, count = self.num_episodes, len(episode.table)
+        table = episode.table
+        index = np.arange(self.num_frames, self.num_frames + count)
+        for name, values in (("index", index), ("episode_index", np.full(count, number))):
+            at = table.schema.get_field_index(name)
+            field = table.schema.field(at)
+            table = table.set_column(at, field, pa.array(values, field.type))
+        if episode.row.data != self._source:  # one file for each of the source
+            self._close()
+            path = self._folder / self._data_path(self._files)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(path, table.schema, compression="snappy")
+            self._source, self._files = episode.row.data, self._files + 1
+        assert self._writer is not None
+        self._writer.write_table(table, row_group_size=count)
+        self._rows.append(self._row(episode, number, count))
+        self.num_frames += count
+        for span in episode.row.videos.values():
+            target = self._folder / span.path.relative_to(self._reader.root)
+            if not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(span.path, target)
+
+    def finish(self) -> None:
+        """Write the tables."""
+        self._close()
+        reader, count = self._reader, self.num_episodes
+        tasks = {name: number for number, name in reader.tasks.items()}
+        info = dict(reader.info)
+        totals = {"total_episodes": count, "total_frames": self.num_frames}
+        info |= {**totals, "total_tasks": len(tasks), "splits": {"train": f"0:{count}"}}
+        total = {key: aggregate(parts) for key, parts in self._stats.items() if parts}
+        counts = {key: sum(n for n, _ in self._stats[key]) for key in total}
+        stats = {
+            key: {**{name: v.tolist() for name, v in value.items()}, "count": [counts[key]]}
+            for key, value in total.items()
+        }
+        files.write_json(self._folder / schema.INFO_PATH, info)
+        files.write_json(self._folder / schema.STATS_PATH, stats)
+        frame = pd.DataFrame({"task_index": list(tasks.values())}, pd.Index(tasks, name="task"))
+        frame.to_parquet(self._folder / schema.TASKS_PATH)
+        path = self._folder / schema.EPISODES_PATH.format(chunk_index=0, file_index=0)
+        path.parent.mkdir(parents=True)
+        names = dict.fromkeys(name for row in self._rows for name in row)
+        rows = [{name: row.get(name) for name in names} for row in self._rows]
+        pq.write_table(pa.Table.from_pylist(rows), path)
+
+    def _close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None
+
+    def _data_path(self, number: int) -> str:
+        size = self._reader.info.get("chunks_size")
+        chunk, file = divmod(number, size if type(size) is int and size > 0 else schema.CHUNK_FILES)
+        return str(self._reader.info["data_path"]).format(chunk_index=chunk, file_index=file)
+
+    def _row(self, episode: SoundEpisode, number: int, count: int) -> dict[str, Any]:
+        """Its row in ``meta/episodes``."""
+        reader, old = self._reader, episode.row
+        tasks = dict.fromkeys(episode.values["task_index"][:, 0].tolist())
+        path = self._data_path(self._files - 1)
+        row = {k: v for k, v in old.columns.items() if not k.startswith(("stats/", "videos/"))}
+        row |= {
+            "episode_index": number,
+            "tasks": [reader.tasks[task] for task in tasks],
+            "length": count,
+            **_numbers(reader.info["data_path"], path, "data"),
+            "dataset_from_index": self.num_frames,
+            "dataset_to_index": self.num_frames + count,
+            **{f"meta/episodes/{name}": 0 for name in ("chunk_index", "file_index")},
+        }
+        for key, span in old.videos.items():
+            name = span.path.relative_to(reader.root).as_posix()
+            template = str(reader.info["video_path"]).replace("{video_key}", key)
+            row |= _numbers(template, name, f"videos/{key}")
+            row[f"videos/{key}/from_timestamp"] = span.start_s
+            row[f"videos/{key}/to_timestamp"] = span.start_s + count / reader.fps
+        for key, feature in reader.features.items():
+            frames, stats = self._statistics(episode, feature, number)
+            if stats:
+                self._stats.setdefault(key, []).append((frames, stats))
+                row |= {f"stats/{key}/{name}": value.tolist() for name, value in stats.items()}
+                row[f"stats/{key}/count"] = [frames]
+        return row
+
+    def _statistics(
+        self, episode: SoundEpisode, feature: Feature, number: int
+    ) -> tuple[int, Statistics]:
+        """Number of frames, and statistics; none of strings. Those of cameras are as recorded, or
+        of some frames."""
+        key, count = feature.key, len(episode.table)
+        if feature.is_camera:
+            recorded = dict(episode.row.stats(key))
+            frames = (recorded.pop("count", None) or [count])[0]
+            if recorded and None not in recorded.values():
+                return frames, {name: np.array(v, np.float64) for name, v in recorded.items()}
+            return _camera_statistics(episode, feature, self._reader.fps)
+        if key not in episode.values or not feature.is_numeric:
+            return count, {}
+        values = episode.values[key]
+        if key in ("index", "episode_index"):
+            first, step = (number, 0) if key == "episode_index" else (self.num_frames, 1)
+            values = first + step * np.arange(count)[:, None]
+        values = values.reshape(-1, feature.shape[-1])
+        return count, _with_quantiles(values)
+
+
+def _with_quantiles(values: NDArray[Any]) -> Statistics:
+    found = np.quantile(values.astype(np.float64), QUANTILES, axis=0)
+    names = (f"q{round(100 * q):02d}" for q in QUANTILES)
+    return {**describe(values), **dict(zip(names, found, strict=True))}
+
+
+def _camera_statistics(
+    episode: SoundEpisode, feature: Feature, fps: float
+) -> tuple[int, Statistics]:
+    """Statistics per channel of up to 20 frames, (C, 1, 1) each, of colours in [0, 1]."""
+    count = len(episode.table)
+    places = np.unique(np.linspace(0, count - 1, min(count, _SAMPLED_FRAMES)).round().astype(int))
+    if feature.dtype == "video":
+        if feature.is_depth:
+            return 0, {}  # its values are codes of a quantisation
+        span = episode.row.videos[feature.key]
+        frames = decode_frames(span.path, span.start_s + places / fps)
+        images = [frame.to_ndarray(format="rgb24") for frame in frames]
+    else:
+        column = episode.table[feature.key]
+        contents = [(place, column[place].as_py()) for place in places.tolist()]
+        images = [np.asarray(decode_image(c, place, feature.key)) for place, c in contents]
+    pixels = np.concatenate(
+        [image.reshape(image.shape[0] * image.shape[1], -1) for image in images]
+    )
+    stats = _with_quantiles(pixels if feature.is_depth else pixels / 255.0)
+    return len(images), {name: value[:, None, None] for name, value in stats.items()}
+
+
+def _numbers(template: str, path: str, prefix: str) -> dict[str, int]:
+    """Columns with the chunk and file index of a file name of the template."""
+    pattern = re.escape(template)
+    for name in ("chunk_index", "file_index"):
+        pattern = re.sub(rf"\\\{{{name}(:[^}}]*)?\\\}}", rf"(?P<{name}>\\d+)", pattern, count=1)
+    found = re.fullmatch(pattern, path)
+    if found is None:
+        raise DataError(f"{path} is not a file of the template {template}")
+    return {f"{prefix}/{name}": int(number) for name, number in found.groupdict().items()}
+
+
+def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> tuple[int, int]:
+    """Write the episodes with these numbers to the new dataset ``root``; returns how many
+    episodes and frames.
+
+    Raises:
+        DataError: one of them has a problem.
+    """
+    wanted = set(episodes)
+    with new_dataset(root) as folder:
+        writer = SubsetWriter(reader, folder)
+        for found in EpisodeScan(reader):
+            if isinstance(found, DataError):
+                if found.episode is None or found.episode in wanted:
+                    raise DataError(f"{found}; `egovcp-dataset repair` keeps what is sound")
+            elif found.row.index in wanted:
+                writer.add(found)
+        writer.finish()
+    return writer.num_episodes, writer.num_frames

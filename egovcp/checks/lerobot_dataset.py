@@ -1,0 +1,411 @@
+"""Check of a LeRobot v3 dataset of any features: tables, rows, images, videos, statistics.
+
+It finds what LeRobot would read wrongly, or stop at. `egovcp.checks.dataset` adds the contract of
+egovcp's own datasets.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from egovcp.checks.feature_statistics import (
+    Statistics,
+    aggregate,
+    camera_statistics_problems,
+    describe,
+    statistics_problems,
+)
+from egovcp.data import schema
+from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
+from egovcp.data.paths import files_below, require_file
+from egovcp.data.pictures import decode_frames, decode_image, frame_times
+from egovcp.errors import DataError
+
+type Progress = Callable[[int, int], None]
+type Problem = tuple[int | None, str]
+"""First frame at fault, or None; the problem."""
+
+#: LeRobot's editing tools copy these statistics unchanged from the source dataset.
+STALE: Final = ("index", "episode_index", "task_index")
+#: LeRobot's default `tolerance_s`: a frame farther from its timestamp raises an error.
+TOLERANCE_S: Final = 1e-4
+_FLOAT32: Final = 2.0**-22  # relative error of a float32 timestamp
+_RANGE: Final = re.compile(r"(\d{1,18}):(\d{1,18})", re.ASCII)
+
+
+def lerobot_problems(
+    root: Path, progress: Progress | None = None, notes: list[str] | None = None
+) -> Iterator[DataError]:
+    """All problems of a LeRobot v3 dataset; what is not checked is appended to ``notes``."""
+    try:
+        reader = LeRobotReader(root)
+    except DataError as error:
+        yield error
+        return
+    check = LeRobotCheck(reader)
+    yield from reader.problems
+    yield from check.table_problems()
+    for path in reader.data_files:
+        yield from check.file_problems(path, progress)
+    yield from check.total_problems()
+    if notes is not None:
+        notes += check.notes()
+
+
+class LeRobotCheck:
+    """The checks of one dataset; call `table_problems`, then `file_problems` of every data file in
+    order, then `total_problems`. A wrong shape or a missing column is reported once for each file,
+    or, if ``every``, for each episode."""
+
+    def __init__(self, reader: LeRobotReader, every: bool = False) -> None:
+        self.reader, self._every = reader, every
+        self.by_number: dict[int, EpisodeRow] = {}
+        """Number -> its first row in ``meta/episodes``."""
+        for row in reader.rows:
+            self.by_number.setdefault(row.index, row)
+        self._seen: dict[int, Path] = {}
+        self._frames = 0
+        self._shapes: set[tuple[Path, str]] = set()
+        self._sums: dict[str, list[tuple[int, Statistics]]] = {}
+        self._valid_frames = 0
+        self._has_av = importlib.util.find_spec("av") is not None
+        self._times = lru_cache(maxsize=16)(frame_times)
+
+    def table_problems(self) -> Iterator[DataError]:
+        """Problems of ``info.json`` and ``meta/episodes``."""
+        reader, info = self.reader, self.reader.root / schema.INFO_PATH
+        for key in schema.INDEX_FEATURES:
+            if key not in reader.features:
+                yield DataError.at(info, f"feature {key} is missing; LeRobot adds it to all data")
+        names = set(reader.tasks.values())
+        end = 0
+        for number, row in enumerate(reader.rows):
+            for problem in _row_problems(row, number, end):
+                yield DataError.at(row.file, problem, row.index)
+            end = row.end
+            if unknown := sorted(set(row.tasks) - names) if names else []:
+                problem = f"its task {unknown[0]!r} is not in {schema.TASKS_PATH}"
+                yield DataError.at(row.file, problem, row.index)
+        if not reader.problems:
+            totals = {
+                "total_episodes": (len(reader.rows), "meta/episodes lists"),
+                "total_frames": (reader.num_frames, "the lengths in meta/episodes add up to"),
+                "total_tasks": (len(reader.tasks), f"{schema.TASKS_PATH} lists"),
+            }
+            for name, (count, source) in totals.items():
+                if reader.info.get(name) != count:
+                    problem = f"{name} is {reader.info.get(name)}, but {source} {count}"
+                    yield DataError.at(info, problem)
+            for problem in split_problems(reader.info, len(reader.rows)):
+                yield DataError.at(info, problem)
+
+    def file_problems(self, path: Path, progress: Progress | None = None) -> Iterator[DataError]:
+        """Problems of a data file, its episodes, and their videos and statistics."""
+        listed = [row.index for row in self.by_number.values() if row.data == path]
+        try:
+            names = self.reader.open_data(path).schema_arrow.names
+        except DataError as error:
+            self._frames += sum(self.by_number[number].length for number in listed)
+            problem = f"{error.problem}{_lost(listed)}"
+            yield DataError.at(path, problem, listed[0] if listed else None)
+            return
+        columns = [k for k, f in self.reader.features.items() if f.dtype != "video"]
+        if "episode_index" not in names:
+            yield DataError.at(path, "lacks the column episode_index")
+            return
+        if unknown := sorted(set(names) - set(columns)):
+            problem = f"columns that {schema.INFO_PATH} does not know: {', '.join(unknown)}"
+            yield DataError.at(path, problem)
+        present = [key for key in columns if key in names]
+        found = set[int]()
+        for part in self.reader.episodes(path, present):
+            if isinstance(part, DataError):
+                yield part
+                continue
+            number, table = part
+            found.add(number)
+            yield from self._episode_problems(path, number, table)
+            if progress is not None:
+                progress(len(self._seen), max(len(self.reader.rows), len(self._seen)))
+        for number in listed:
+            if number not in found:
+                yield DataError.at(path, "meta/episodes lists it here, but it has no row", number)
+
+    def total_problems(self) -> Iterator[DataError]:
+        """Problems of the whole: episodes in no table, and ``stats.json``."""
+        reader = self.reader
+        if unlisted := sorted(set(self._seen) - set(self.by_number)):
+            more = f" (and {len(unlisted) - 1} more)" if len(unlisted) > 1 else ""
+            problem = f"its rows are here, but meta/episodes does not list it{more}"
+            yield DataError.at(self._seen[unlisted[0]], problem, unlisted[0])
+        path = reader.root / schema.STATS_PATH
+        complete = self._valid_frames == self._frames == reader.num_frames
+        for key, feature in reader.features.items():
+            found = reader.stats.get(key)
+            if not isinstance(found, dict) or key in STALE:
+                continue
+            if feature.is_camera:
+                problems = camera_statistics_problems(found, feature)
+            elif complete and key in self._sums:
+                problems = statistics_problems(found, aggregate(self._sums[key]), feature)
+            else:
+                continue
+            yield from (DataError.at(path, f"{key}: {problem}") for problem in problems)
+
+    def notes(self) -> list[str]:
+        """What is not checked, one line each."""
+        features, stats = self.reader.features, self.reader.stats
+        cameras = [key for key, feature in features.items() if feature.is_camera]
+        language = self.reader.keys("language")
+        lacking = [
+            key for key, f in features.items() if key not in stats and (f.is_numeric or f.is_camera)
+        ]
+        videos = self.reader.keys("video")
+        notes = {
+            f"videos ({', '.join(videos)}): PyAV is not installed; "
+            "pip install 'egovcp[video]'": bool(videos) and not self._has_av,
+            f"videos ({', '.join(videos)}): all times are checked, but of each episode only the "
+            "first and the last frame are decoded": bool(videos) and self._has_av,
+            "timestamps against frame_index / fps, which may differ without videos": not videos,
+            f"statistics of cameras ({', '.join(cameras)}) against their pixels, of which LeRobot "
+            "samples some": bool(cameras),
+            f"statistics of {', '.join(lacking)}: none are recorded": bool(lacking and stats),
+            f"statistics of {', '.join(STALE)}, which LeRobot's editing tools copy from their "
+            "source": True,
+            f"content of {', '.join(language)}": bool(language),
+            "reward, success and end of episodes: there is no next.reward or next.done": not (
+                {"next.reward", "next.done"} & features.keys()
+            ),
+            "images/, the frames of an interrupted recording, which LeRobot does not read; remove "
+            "it to save space": bool(files_below(self.reader.root / "images")),
+            "how it was collected: there is no meta/collection.json": True,
+        }
+        return [note for note, applies in notes.items() if applies]
+
+    def episode_problems(
+        self, path: Path, number: int, table: pa.Table
+    ) -> Iterator[DataError | dict[str, NDArray[Any]]]:
+        """Problems of the rows of an episode and of its videos; at the end its numeric values,
+        (T, n) of each feature, if there is no problem."""
+        problems = 0
+        values: dict[str, NDArray[Any]] = {}
+        for key, feature in self.reader.features.items():
+            if feature.dtype in ("video", "language"):
+                continue
+            try:
+                if key not in table.column_names:
+                    raise _without_place(f"lacks the column {key} of {schema.INFO_PATH}")
+                if feature.dtype == "image":
+                    _check_images(table[key], feature)
+                    continue
+                values[key] = values_of(table[key], feature)
+            except DataError as error:
+                problems += 1
+                of_file = "shape" in error.problem or "column" in error.problem
+                if self._every or not of_file or (path, key) not in self._shapes:
+                    yield DataError.at(path, error.problem, number, error.frame)
+                self._shapes.add((path, key))
+        for frame, problem in _value_problems(values, self.reader):
+            problems += 1
+            yield DataError.at(path, problem, number, frame)
+        row = self.by_number.get(number)
+        if row is not None and "timestamp" in values:
+            times = values["timestamp"][:, 0].astype(np.float64)
+            for video_error in self.video_problems(row, times):
+                problems += 1
+                yield video_error
+        if not problems:
+            yield values
+
+    def video_problems(self, row: EpisodeRow, times: NDArray[np.float64]) -> Iterator[DataError]:
+        """Problems of the videos of an episode with timestamps (T,), s."""
+        for key, span in row.videos.items() if self._has_av else ():
+            path, problem, frame = span.path, "", None
+            try:
+                require_file(self.reader.root, path)
+                shown = self._times(path)
+                frame, problem = _span_problem(shown, span.start_s + times)
+                if not problem:
+                    near = np.abs(shown[:, None] - (span.start_s + times[[0, -1]])).argmin(0)
+                    for at in near.tolist():
+                        image = next(decode_frames(path, [shown[at]]), None)
+                        if image is None:
+                            raise DataError.at(path, "the video is damaged: a frame is unreadable")
+                        _check_size((image.width, image.height), self.reader.features[key])
+            except DataError as error:
+                problem = error.problem or str(error)
+            if problem:
+                yield DataError.at(path, problem, row.index, frame)
+
+    def _episode_problems(self, path: Path, number: int, table: pa.Table) -> Iterator[DataError]:
+        row = self.by_number.get(number)
+        first, self._frames = self._frames, self._frames + (row.length if row else len(table))
+        if number in self._seen:
+            problem = f"its rows are not together: it also has rows in {self._seen[number].name}"
+            yield DataError.at(path, f"{problem}, or its episode_index is repeated", number)
+        self._seen.setdefault(number, path)
+        if row is not None:
+            if row.data != path:
+                place = row.data.relative_to(self.reader.root)
+                yield DataError.at(path, f"meta/episodes lists it in {place}", number)
+            if row.length != len(table):
+                problem = f"meta/episodes gives it {row.length} frames, but it has {len(table)}"
+                yield DataError.at(path, problem, number)
+            elif row.start != first:
+                problem = f"meta/episodes says that it begins at row {row.start} of the dataset"
+                yield DataError.at(path, f"{problem}, but it begins at row {first}", number)
+        values = None
+        for found in self.episode_problems(path, number, table):
+            if isinstance(found, DataError):
+                yield found
+            else:
+                values = found
+        if values is None:
+            return
+        self._valid_frames += len(table)
+        at = _first_difference(values["index"][:, 0], first + np.arange(len(table)))
+        if at is not None:
+            yield DataError.at(path, f"column index does not count from {first}", number, at)
+        for key, feature in self.reader.features.items():
+            if key not in values or not feature.is_numeric or key in STALE:
+                continue
+            # LeRobot reduces all axes but the last.
+            statistics = describe(values[key].reshape(-1, feature.shape[-1]))
+            self._sums.setdefault(key, []).append((len(table), statistics))
+            if row is not None and (recorded := row.stats(key)):
+                for problem in statistics_problems(recorded, statistics, feature):
+                    yield DataError.at(row.file, f"statistics of {key}: {problem}", number)
+
+
+def _row_problems(row: EpisodeRow, number: int, end: int) -> Iterator[str]:
+    """Problems of row ``number`` of the table; the episode before it ends at ``end``."""
+    if row.index < number:
+        yield f"listed twice, in row {number} again; episode_index counts from 0"
+    elif row.index > number:
+        yield f"listed in row {number}; episode_index counts from 0"
+    frames = row.end - row.start
+    if row.length != frames or row.length < 1:
+        place = f"dataset_from_index {row.start} and dataset_to_index {row.end}"
+        yield f"its length is {row.length}, but {place} give {frames} frames"
+    if row.start != end:
+        yield f"its dataset_from_index is {row.start}, but the episode before it ends at {end}"
+
+
+def split_problems(info: Mapping[str, Any], episodes: int) -> Iterator[str]:
+    """Problems of the ``splits`` of ``info.json``."""
+    splits = info.get("splits")
+    if not isinstance(splits, dict) or not splits:
+        yield f"splits is {splits!r}, expected ranges of episodes such as {{'train': '0:9'}}"
+        return
+    for name, text in splits.items():
+        found = _RANGE.fullmatch(text) if isinstance(text, str) else None
+        if found is None or not int(found[1]) <= int(found[2]) <= episodes:
+            yield f"split {name} is {text!r}, expected a range within 0:{episodes}"
+
+
+def _lost(episodes: list[int]) -> str:
+    """`` (episodes 3 to 7)`` for those that a file holds."""
+    if not episodes:
+        return ""
+    first, last = min(episodes), max(episodes)
+    return f" (episode {first})" if first == last else f" (episodes {first} to {last})"
+
+
+def _value_problems(values: Mapping[str, NDArray[Any]], reader: LeRobotReader) -> Iterator[Problem]:
+    for key, array in values.items():
+        if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
+            at = int(np.argmin(finite.all(1)))
+            label = reader.features[key].label(int(np.argmin(finite[at])))
+            yield at, f"{label} is {array[at][~finite[at]][0]}, expected a finite number"
+    if "frame_index" in values:
+        found = values["frame_index"][:, 0]
+        at_frame = _first_difference(found, np.arange(len(found)))
+        if at_frame is not None:
+            problem = f"frame_index is {found[at_frame]}, expected {at_frame}"
+            yield at_frame, f"{problem}: a frame is missing, repeated, or of another episode"
+    if "timestamp" in values:
+        times = values["timestamp"][:, 0].astype(np.float64)
+        yield from _time_problems(times, reader.fps, bool(reader.keys("video")))
+    if "task_index" in values and reader.tasks:
+        known = np.isin(values["task_index"][:, 0], list(reader.tasks))
+        if not known.all():
+            at = int(np.argmin(known))
+            index = values["task_index"][at, 0]
+            yield at, f"task_index {index} is not in {schema.TASKS_PATH}, which has no text for it"
+
+
+def _time_problems(times: NDArray[np.float64], fps: float, has_videos: bool) -> Iterator[Problem]:
+    expected = np.arange(len(times)) / fps
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        at = int(back[0]) + 1
+        yield at, f"timestamp {times[at]:g} s follows {times[at - 1]:g} s; timestamps must increase"
+        return
+    off = np.abs(times - expected)
+    late = np.flatnonzero(off > TOLERANCE_S + _FLOAT32 * expected)
+    if len(late) and has_videos:
+        at = int(late[0])
+        problem = f"timestamp {times[at]:g} s, expected {expected[at]:g} at {fps:g} fps"
+        yield at, f"{problem}; LeRobot does not find its video frame"
+
+
+def _span_problem(
+    shown: NDArray[np.float64], wanted: NDArray[np.float64]
+) -> tuple[int | None, str]:
+    """The first of the times ``wanted`` (T,) that a video with frame times (F,) does not show."""
+    if not len(shown):
+        return None, "the video has no frame"
+    right = np.clip(np.searchsorted(shown, wanted), 1, max(len(shown) - 1, 1))
+    pair = np.stack([shown[right - 1], shown[np.minimum(right, len(shown) - 1)]])
+    distance = np.abs(pair - wanted).min(0)
+    far = np.flatnonzero(distance > TOLERANCE_S + _FLOAT32 * wanted)
+    if not len(far):
+        return None, ""
+    at = int(far[0])
+    if wanted[at] > shown[-1]:
+        missing = int((wanted > shown[-1] + TOLERANCE_S).sum())
+        end = f"the video ends at {shown[-1]:g} s after {len(shown)} frames"
+        return at, f"{end}; {missing} of the episode's {len(wanted)} frames are missing"
+    return at, (
+        f"no video frame within {TOLERANCE_S * 1e3:g} ms of {wanted[at]:.5f} s, the nearest is "
+        f"{distance[at] * 1e3:.3g} ms away; LeRobot raises FrameTimestampError"
+    )
+
+
+def _check_images(column: pa.ChunkedArray, feature: Feature) -> None:
+    for frame, content in enumerate(value.as_py() for value in column):
+        image = decode_image(content, frame, feature.key)
+        try:
+            _check_size(image.size, feature)
+        except DataError as error:
+            error.frame = frame
+            raise
+
+
+def _check_size(size: tuple[int, int], feature: Feature) -> None:
+    """Raise `DataError` if a picture (width, height) has not the shape of its feature, which may
+    have the channels first or last."""
+    width, height = size
+    if (height, width) not in (feature.shape[:2], feature.shape[-2:]):
+        shape = list(feature.shape)
+        raise _without_place(f"{feature.key} is {height}x{width}, but its shape is {shape}")
+
+
+def _without_place(problem: str) -> DataError:
+    error = DataError(problem)
+    error.problem = problem
+    return error
+
+
+def _first_difference(found: NDArray[Any], expected: NDArray[Any]) -> int | None:
+    wrong = np.flatnonzero(found != expected)
+    return int(wrong[0]) if len(wrong) else None

@@ -1,0 +1,393 @@
+"""Reads a LeRobot v3 dataset of any features: its tables and rows.
+
+`DatasetReader` reads egovcp's own datasets; this reader makes no assumption about features, sizes
+and rates. It keeps going after a problem, so that all problems can be listed.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from egovcp.data import metadata, schema, tiff
+from egovcp.data.parquet import data_errors, open_parquet
+from egovcp.data.paths import files_below, require_file
+from egovcp.errors import DataError
+
+_TABLE_COLUMNS: Final = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
+_DATA_PLACE: Final = ("data/chunk_index", "data/file_index")
+#: The problem of a parquet file without a footer, which LeRobot writes at the end.
+UNFINISHED: Final = (
+    "the end of the file is missing: its recording was interrupted before LeRobot's finalize(), or "
+    "it was copied incompletely; its rows are lost"
+)
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature of ``info.json``."""
+
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...]
+    """Of the values, if there is one for each."""
+    is_depth: bool
+
+    @property
+    def is_camera(self) -> bool:
+        return self.dtype in ("image", "video")
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its values are numbers or booleans."""
+        return not self.is_camera and self.dtype not in ("string", "language")
+
+    @property
+    def size(self) -> int:
+        """Values per frame."""
+        return int(np.prod(self.shape))
+
+    def label(self, value: int) -> str:
+        """Name of one of its values, ``"action[3] (gripper)"``."""
+        place = self.key if self.size == 1 else f"{self.key}[{value}]"
+        return f"{place} ({self.names[value]})" if self.names else place
+
+
+@dataclass(frozen=True)
+class VideoSpan:
+    """Part of a video file that shows an episode."""
+
+    path: Path
+    start_s: float
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """A row of ``meta/episodes``."""
+
+    file: Path
+    index: int
+    length: int
+    start: int
+    """Global index of the first frame."""
+    end: int
+    data: Path
+    videos: Mapping[str, VideoSpan] = field(default_factory=dict)
+    columns: Mapping[str, Any] = field(default_factory=dict)
+    """All columns of the row."""
+
+    @property
+    def tasks(self) -> list[str]:
+        return list(self.columns.get("tasks") or ())
+
+    def stats(self, key: str) -> dict[str, Any]:
+        """Recorded statistics of a feature; empty if there are none."""
+        prefix = f"stats/{key}/"
+        found = {k.removeprefix(prefix): v for k, v in self.columns.items() if k.startswith(prefix)}
+        return found if any(value is not None for value in found.values()) else {}
+
+
+class LeRobotReader:
+    """A LeRobot v3 dataset in a folder."""
+
+    def __init__(self, root: Path) -> None:
+        """Read the `meta` folder; `problems` has what is wrong with the tables.
+
+        Raises:
+            DataError: ``info.json`` cannot be used.
+        """
+        self.root = root
+        self.info: Mapping[str, Any] = metadata.load_v3_info(root)
+        """``meta/info.json``."""
+        self.features = {key: _feature(key, f) for key, f in self.info["features"].items()}
+        self.problems: list[DataError] = []
+        self.tasks: Mapping[int, str] = {}
+        """``meta/tasks.parquet``: task index -> task."""
+        self.stats: Mapping[str, Any] = {}
+        """``meta/stats.json``."""
+        self.rows: list[EpisodeRow] = []
+        """``meta/episodes``, in order."""
+        try:
+            self.tasks = metadata.load_tasks(root)
+        except DataError as error:
+            self.problems.append(error)
+        try:
+            self.stats = metadata.load_stats(root)
+        except DataError as error:
+            self.problems.append(error)
+        try:
+            files = metadata.episode_files(root)
+        except DataError as error:
+            files = []
+            self.problems.append(error)
+        for path in files:
+            try:
+                self.rows += self._table_rows(path)
+            except DataError as error:
+                self.problems.append(explained(error))
+
+    @classmethod
+    def open(cls, root: Path) -> Self:
+        """Read a dataset whose tables must be sound; raises the first of `problems`."""
+        reader = cls(root)
+        for error in reader.problems:
+            raise error
+        return reader
+
+    @property
+    def fps(self) -> float:
+        return float(self.info["fps"])
+
+    @property
+    def num_frames(self) -> int:
+        return sum(row.length for row in self.rows)
+
+    @property
+    def data_files(self) -> list[Path]:
+        """The data files that are listed or present: LeRobot reads all of them."""
+        present = [p for p in files_below(self.root / "data") if p.suffix == ".parquet"]
+        return sorted({*present, *(row.data for row in self.rows)})
+
+    def keys(self, dtype: str) -> list[str]:
+        """The features of a dtype."""
+        return [key for key, feature in self.features.items() if feature.dtype == dtype]
+
+    @property
+    def numeric(self) -> list[Feature]:
+        """Features of numbers that are not part of every dataset."""
+        return [
+            f for k, f in self.features.items() if f.is_numeric and k not in schema.INDEX_FEATURES
+        ]
+
+    def open_data(self, path: Path) -> pq.ParquetFile:
+        """Open a data file; raises `DataError`."""
+        require_file(self.root, path)
+        try:
+            return open_parquet(path, own=False)
+        except DataError as error:
+            raise explained(error) from error
+
+    def episodes(
+        self, path: Path, keys: Sequence[str] | None = None
+    ) -> Iterator[tuple[int, pa.Table] | DataError]:
+        """(Number, rows) of each episode in a data file; ``keys`` selects columns.
+
+        Unreadable parts are returned as errors.
+        """
+        try:
+            file = self.open_data(path)
+        except DataError as error:
+            yield error
+            return
+        wanted = [*dict.fromkeys([*keys, "episode_index"])] if keys is not None else None
+        yield from episode_runs(file, path, wanted)
+
+    def read(self, row: EpisodeRow, keys: Sequence[str]) -> pa.Table:
+        """Some columns of the rows of an episode; raises `DataError`."""
+        for found in self.episodes(row.data, keys):
+            if isinstance(found, DataError):
+                raise found
+            if found[0] == row.index:
+                return found[1]
+        raise DataError.at(row.data, "holds no row of it", row.index)
+
+    def _table_rows(self, path: Path) -> Iterator[EpisodeRow]:
+        require_file(self.root, path)
+        with data_errors(path):
+            file = open_parquet(path, own=False)
+            names = file.schema_arrow.names
+            videos = self.keys("video")
+            places = [f"videos/{key}/{name}" for key in videos for name in _VIDEO_PLACE]
+            for name in (*_TABLE_COLUMNS, *_DATA_PLACE, *places):
+                if name not in names:
+                    raise DataError.at(path, f"column {name} is missing")
+            rows = file.read().to_pylist()
+        for number, row in enumerate(rows):
+            empty = [name for name in (*_TABLE_COLUMNS, *_DATA_PLACE, *places) if row[name] is None]
+            if empty:
+                problem = f"column {empty[0]} is empty in row {number}"
+                self.problems.append(DataError.at(path, problem, row["episode_index"]))
+                continue
+            with data_errors(path):
+                index, length, start, end = (int(row[name]) for name in _TABLE_COLUMNS)
+                yield EpisodeRow(
+                    path,
+                    index,
+                    length,
+                    start,
+                    end,
+                    data=self._path(self.info["data_path"], row, "data"),
+                    videos={key: self._span(key, row) for key in videos},
+                    columns=row,
+                )
+
+    def _span(self, key: str, row: Mapping[str, Any]) -> VideoSpan:
+        path = self._path(self.info["video_path"], row, f"videos/{key}", key)
+        return VideoSpan(path, float(row[f"videos/{key}/from_timestamp"]))
+
+    def _path(self, template: str, row: Mapping[str, Any], prefix: str, key: str = "") -> Path:
+        numbers = {n: int(row[f"{prefix}/{n}"]) for n in ("chunk_index", "file_index")}
+        return self.root / template.format(video_key=key, **numbers)
+
+
+_VIDEO_PLACE: Final = ("chunk_index", "file_index", "from_timestamp")
+
+
+def is_own(root: Path) -> bool:
+    """Whether the dataset claims to be one of egovcp's: it has ``meta/collection.json``, or its
+    actions name the low-level controller that executed them."""
+    path = root / schema.COLLECTION_PATH
+    if path.exists() or path.is_symlink():
+        return True
+    try:
+        features = metadata.load_json_object(root / schema.INFO_PATH, root)["features"]
+        return "controller_id" in features["action"]["info"]
+    except (DataError, LookupError, TypeError):
+        return (root / schema.HASHES_PATH).exists()
+
+
+def explained(error: DataError) -> DataError:
+    """The error; one of a parquet file without a footer says how that comes about."""
+    if not any(text in error.problem for text in ("magic bytes", "Parquet file size is")):
+        return error
+    return DataError.at(error.file, f"{error.problem.rstrip('.')}; {UNFINISHED}", error.episode)
+
+
+def episode_runs(
+    file: pq.ParquetFile, path: Path, columns: Sequence[str] | None = None
+) -> Iterator[tuple[int, pa.Table] | DataError]:
+    """(``episode_index``, rows) of the consecutive rows of each episode in a data file.
+
+    Episodes may span row groups, which are read one at a time. A damaged one gives an error for
+    each of its episodes, if they can be determined.
+    """
+    number, parts = -1, list[pa.Table]()
+    for group in range(file.num_row_groups):
+        try:
+            with data_errors(path):
+                table = file.read_row_group(group, columns=columns, use_threads=False)
+                runs = list(_split_by_episode(table))
+        except DataError as error:
+            lost = _episode_numbers(file, group)
+            yield from (DataError.at(path, error.problem, n) for n in lost)
+            if not lost:
+                yield DataError.at(path, f"{error.problem} (row group {group})")
+            parts = parts if number not in lost else []
+            continue
+        for run_number, part in runs:
+            if run_number != number and parts:
+                yield number, pa.concat_tables(parts)
+                parts = []
+            number = run_number
+            parts.append(part)
+    if parts:
+        yield number, pa.concat_tables(parts)
+
+
+def _split_by_episode(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
+    """Consecutive rows with the same ``episode_index``."""
+    column = table["episode_index"]
+    if column.null_count:
+        raise DataError("column episode_index is empty in a row")
+    numbers = np.asarray(column.to_numpy(), np.int64)
+    edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
+    for first, last in itertools.pairwise(edges):
+        if last > first:
+            yield int(numbers[first]), table.slice(first, last - first)
+
+
+def _episode_numbers(file: pq.ParquetFile, group: int) -> list[int]:
+    """The episodes of a damaged row group, if that column is readable."""
+    try:
+        column = file.read_row_group(group, columns=["episode_index"], use_threads=False)[0]
+        return sorted(set(column.to_pylist()))
+    except (pa.ArrowException, OSError):
+        return []
+
+
+def _feature(key: str, found: Mapping[str, Any]) -> Feature:
+    info = {**(found.get("video_info") or {}), **(found.get("info") or {})}
+    depth = info.get("is_depth_map") or info.get("video.is_depth_map")
+    shape = tuple(int(n) for n in found["shape"])
+    names = tuple(map(str, _flat_names(found.get("names"))))
+    size = int(np.prod(shape))
+    return Feature(
+        key, str(found["dtype"]), shape, names if len(names) == size else (), bool(depth)
+    )
+
+
+def _flat_names(names: object) -> list[object]:
+    """Names may be a list, or a dictionary of lists."""
+    if isinstance(names, Mapping):
+        return [name for part in names.values() for name in _flat_names(part)]
+    return list(names) if isinstance(names, list | tuple) else []
+
+
+def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
+    """The column of a feature that is no camera as (T, n), n values per frame.
+
+    Raises:
+        DataError: with `frame` set, a value is missing or the shape differs from the feature's.
+    """
+    array = column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        array = pa.concat_arrays(array.chunks)
+    frames, levels, per_frame, key = len(array), 0, 1, feature.key
+    while True:
+        if isinstance(array, pa.ExtensionArray):
+            array = array.storage
+        if array.null_count:
+            at = int(np.argmax(array.is_null().to_numpy(zero_copy_only=False)))
+            raise tiff.frame_error(at // per_frame, f"{key} is empty")
+        if not _is_list(array.type):
+            break
+        want = feature.shape[levels] if levels < len(feature.shape) else 0
+        sizes = pc.list_value_length(array).to_numpy(zero_copy_only=False)
+        if (sizes != want).any():
+            at = int(np.argmax(sizes != want))
+            given = f"{sizes[at]} values" if not levels else f"{sizes[at]} values at level {levels}"
+            problem = f"{key} has {given}, but {schema.INFO_PATH} gives its shape as "
+            raise tiff.frame_error(at // per_frame, problem + str(list(feature.shape)))
+        per_frame, levels, array = per_frame * want, levels + 1, array.flatten()
+    if levels != len(feature.shape) and (levels, feature.size) != (0, 1):
+        problem = f"{key} holds single values, but its shape is {list(feature.shape)}"
+        raise tiff.frame_error(0, problem)
+    if _kind(array.type) != _kind_of(feature.dtype):
+        raise tiff.frame_error(0, f"{key} holds {array.type}, but its dtype is {feature.dtype}")
+    return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(frames, per_frame)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return bool(
+        pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind)
+    )
+
+
+def _kind(kind: pa.DataType) -> str:
+    """Kinds are what `datasets` converts into each other."""
+    tests = {
+        "float": pa.types.is_floating,
+        "integer": pa.types.is_integer,
+        "bool": pa.types.is_boolean,
+        "string": lambda t: pa.types.is_string(t) or pa.types.is_large_string(t),
+    }
+    return next((name for name, test in tests.items() if test(kind)), str(kind))
+
+
+def _kind_of(dtype: str) -> str:
+    if dtype == "string":
+        return dtype
+    try:
+        return {"f": "float", "i": "integer", "u": "integer", "b": "bool"}[np.dtype(dtype).kind]
+    except (TypeError, KeyError):
+        return f"unknown dtype {dtype}"

@@ -1,0 +1,238 @@
+"""Finds tasks: in the entry-point group ``egovcp.tasks``, and by reference, ``module:Class``."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import keyword
+import multiprocessing
+import os
+import re
+import sys
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any, Final
+
+from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
+from egovcp.packages import SIMULATOR_MODULES, is_installed, require_packages
+from egovcp.spec import ACTION_TERMS, REWARD_TERMS
+from egovcp.terminal import echo
+
+if TYPE_CHECKING:
+    from egovcp.sim.tasks.base import Task
+
+GROUP: Final = "egovcp.tasks"
+#: References of further tasks, separated by commas; child processes inherit it.
+VARIABLE: Final = "EGOVCP_TASKS"
+#: Stands for all tasks of which datasets can be collected.
+ALL_TASKS: Final = "all"
+#: The task of commands without ``--task``.
+DEFAULT_TASK: Final = "ball"
+
+_NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
+_COLUMNS: Final = tuple(name for name in REWARD_TERMS if name not in (*ACTION_TERMS, "fall"))
+#: Options of the environment besides those of tasks, and other words with a meaning.
+_RESERVED: Final = (
+    *("pose_cost", "action_rate_cost", "controller", "feet", "camera", "sensors", "delay"),
+    *("randomise", "threads", ALL_TASKS),
+)
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task that was found."""
+
+    name: str
+    origin: str
+    """What provides it: ``egovcp 0.1.0``, or a reference."""
+    task: type[Task] | None
+    """None: it cannot be used because of `problem`."""
+    problem: str = ""
+
+    @property
+    def failure(self) -> str:
+        """One line that names the plugin and what to do."""
+        return (
+            f"task {self.name!r} of {self.origin} cannot be used: {self.problem}; repair or "
+            "uninstall it"
+        )
+
+
+_found: list[TaskEntry] | None = None
+
+
+def task_entries() -> tuple[TaskEntry, ...]:
+    """All tasks: those with a `Task.seed_key` first, then by name.
+
+    The first call imports the plugins. What cannot be used is reported once, in one line each on
+    stderr, and stays in the list. Without the simulator there is none.
+    """
+    global _found
+    if not all(map(is_installed, SIMULATOR_MODULES)):
+        return ()
+    if _found is None:
+        _found = []  # a plugin may use the registry while it is imported
+        for point in sorted(_points(), key=lambda p: (p.dist.name != "egovcp", p.dist.name)):
+            _add(point.name, f"{point.dist.name} {point.dist.version}", point.value)
+        for reference in filter(None, os.environ.get(VARIABLE, "").split(",")):
+            _add("", reference, reference)
+        if multiprocessing.parent_process() is None:
+            for entry in _found:
+                if entry.problem:
+                    echo(f"warning: {entry.failure}", error=True)
+    return tuple(sorted(_found, key=_place))
+
+
+def _points() -> Iterable[Any]:
+    return metadata.entry_points(group=GROUP)
+
+
+def _place(entry: TaskEntry) -> tuple[float, str]:
+    key = entry.task.seed_key if entry.task else None
+    return (float("inf") if key is None else key, entry.name)
+
+
+def _add(name: str, origin: str, reference: str) -> TaskEntry:
+    """Import ``module:Class`` and append its entry; an empty ``name`` is that of the class."""
+    assert _found is not None
+    try:
+        task = _load(reference)
+        _check(task)
+        if name and name != task.name:
+            raise ValueError(f"the class {reference} is named {task.name!r}; use one name")
+        for other in _found:
+            if other.name == task.name and other.task is not None:
+                raise ValueError(f"{other.origin} has a task of this name; rename it")
+        entry = TaskEntry(task.name, origin, task)
+    except Exception as error:  # noqa: BLE001 - whatever the import of a plugin raises
+        kind = "" if isinstance(error, ValueError | EgovcpError) else f"{type(error).__name__}: "
+        entry = TaskEntry(name or reference, origin, None, kind + " ".join(str(error).split()))
+    _found.append(entry)
+    return entry
+
+
+def _load(reference: str) -> type[Task]:
+    module, colon, name = reference.partition(":")
+    if not (module and colon and name):
+        raise ValueError(f"{reference!r} is no reference; expected package.module:Class")
+    from egovcp.sim.tasks.base import Task
+
+    found: Any = import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        raise ValueError(f"{reference} is no subclass of egovcp.sim.tasks.Task")
+    return found
+
+
+def _check(task: type[Task]) -> None:
+    """Raise `ValueError` unless the class is complete."""
+    missing = sorted(task.__abstractmethods__)
+    missing += [a for a in ("name", "description", "terms") if not hasattr(task, a)]
+    if missing:
+        raise ValueError(f"the class lacks {', '.join(missing)}")
+    if problem := name_problem(task.name):
+        raise ValueError(problem)
+    for term, column in task.terms.items():
+        if column not in _COLUMNS:
+            raise ValueError(
+                f"terms[{term!r}] is {column!r}, expected one of {', '.join(_COLUMNS)}"
+            )
+        if term in (*ACTION_TERMS, "fall"):
+            raise ValueError(f"{term!r} is a reward term of every task; leave it out of terms")
+    if inspect.isclass(task.config) or not dataclasses.is_dataclass(task.config):
+        raise ValueError("config is no instance of a dataclass derived from TaskConfig")
+
+
+def name_problem(name: str) -> str:
+    """Why a task cannot have this name; empty: it can."""
+    wrong = not _NAME.fullmatch(name) or keyword.iskeyword(name)
+    if not wrong and name not in _RESERVED and not name.endswith("_episode"):
+        return ""
+    return (
+        f"{name!r} cannot be the name of a task: use lower-case letters, digits and _, and no "
+        f"Python keyword, NAME_episode, {', '.join(_RESERVED)}"
+    )
+
+
+def register_task(reference: str) -> str:
+    """Add the task ``package.module:Class`` for this process and its children; returns its name.
+
+    Modules in the working folder are found. Commands do this for ``--task``.
+
+    Raises:
+        UsageError: it cannot be imported, or is not a complete task; the message says why.
+    """
+    folder = os.getcwd()
+    if folder not in sys.path:
+        sys.path.append(folder)
+    for entry in task_entries():
+        if entry.origin == reference and entry.task is not None:
+            return entry.name
+    entry = _add("", reference, reference)
+    if entry.task is None:
+        assert _found is not None
+        _found.remove(entry)
+        raise UsageError(entry.failure)
+    known = filter(None, (os.environ.get(VARIABLE, ""), reference))
+    os.environ[VARIABLE] = ",".join(known)
+    return entry.name
+
+
+def find_task(name: str, option: str = "") -> type[Task]:
+    """The task of this name; ``option`` is named in the error.
+
+    Raises:
+        UsageError: no task has this name.
+        EnvironmentFailure: its plugin is defective.
+    """
+    entries = task_entries()
+    for entry in entries:
+        if entry.name == name and entry.task is not None:
+            return entry.task
+    for entry in entries:
+        if entry.name == name:
+            raise EnvironmentFailure(entry.failure)
+    require_packages("egovcp", f"the task {name!r}", *SIMULATOR_MODULES)
+    where = f"{option}: " if option else ""
+    known = suggest(name, task_names()) if entries else "; install egovcp again: it has no tasks"
+    raise UsageError(
+        f"{where}unknown task {name!r}{known}; a task of another package needs that package "
+        f"(entry-point group {GROUP}), or --task=package.module:Class"
+    )
+
+
+def task_names(training: bool = False) -> tuple[str, ...]:
+    """Names of all usable tasks; with ``training``, of those that datasets are collected of."""
+    tasks = [entry.task for entry in task_entries() if entry.task is not None]
+    return tuple(task.name for task in tasks if task.for_training or not training)
+
+
+def select_tasks(text: str, training: bool = False) -> tuple[str, ...]:
+    """The tasks that ``--task`` selects: one, several separated by commas, or ``all``.
+
+    Raises:
+        UsageError: there is no such task, or, with ``training``, not for this purpose.
+        EnvironmentFailure: the plugin of one is defective.
+    """
+    if text == ALL_TASKS:
+        return task_names(training=True)
+    names = tuple(dict.fromkeys(text.strip("[]").replace(" ", "").split(",")))
+    for name in names:
+        if not find_task(name, "--task").for_training and training:
+            raise UsageError(f"--task={name}: it is only for evaluation; choose single tasks")
+    return names
+
+
+def seed_key(name: str) -> int:
+    """Key of a task's random streams; raises as `find_task`."""
+    key = find_task(name).seed_key
+    return zlib.crc32(name.encode()) if key is None else key
+
+
+def describe_task(name: str) -> str:
+    """`Task.description`; empty for a task that is not installed."""
+    tasks = [entry.task for entry in task_entries() if entry.name == name and entry.task]
+    return tasks[0].description if tasks else ""

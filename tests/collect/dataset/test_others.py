@@ -1,0 +1,152 @@
+"""`egovcp-dataset` on datasets that LeRobot wrote: info, coverage, viz, repair, delete, split."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from egovcp_collect.dataset.cli import main
+from tests.support.lerobot_datasets import KINDS
+
+from . import damage as d
+from .test_others_damage import of_table, rows_of
+
+
+def same_frames(root: Path, original: Path, episodes: list[int]) -> None:
+    """LeRobot reads the same frames from ``root`` as from these episodes of the original."""
+    found = LeRobotDataset("me/found", root=root, video_backend="pyav")
+    expected = LeRobotDataset("me/theirs", root=original, video_backend="pyav")
+    rows = [
+        row
+        for episode in episodes
+        for row in range(
+            expected.meta.episodes[episode]["dataset_from_index"],
+            expected.meta.episodes[episode]["dataset_to_index"],
+        )
+    ]
+    assert found.num_frames == len(rows)
+    for number, row in enumerate(rows):
+        frame, want = found[number], expected[row]
+        for key in expected.features.keys() - {"index", "episode_index"}:
+            np.testing.assert_array_equal(frame[key], want[key])
+        assert (frame["index"], frame["task"]) == (number, want["task"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_info_coverage_and_viz(
+    kind: str, others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    features, lengths, tasks, _ = KINDS[kind]
+    report, root = tmp_path / "report.json", str(others[kind])
+    assert main(["info", root, f"--json={report}"]) == 0
+    info = json.loads(report.read_text())
+    assert (info["episodes"], info["frames"]) == (len(lengths), sum(lengths))
+    assert set(info["tasks"]) == set(tasks)
+    assert "not recorded: there is no meta/collection.json" in capsys.readouterr().out
+    assert main(["coverage", root, f"--json={report}"]) == 0
+    numbers = {key for key, f in features.items() if f["dtype"][:3] in ("flo", "int", "boo")}
+    assert set(json.loads(report.read_text())["features"]) == numbers
+    recording = tmp_path / "episode.rrd"
+    assert main(["viz", root, "--episode=1", f"--output={recording}"]) == 0
+    content = recording.read_bytes()
+    for key, feature in features.items():
+        assert (key.replace(".", "/").encode() in content) == (feature["dtype"] != "string")
+    assert main(["viz", root, f"--episode={len(lengths)}"]) == 2
+
+
+def test_coverage_names_constant_values(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(others["arm"], tmp_path / "copy"))
+    still = lambda values: values.__setitem__(slice(None), [[1.0, v[1]] for v in values])  # noqa: E731
+    rows_of(d.DATA, action=still)(root)
+    assert main(["coverage", str(root)]) == 0
+    assert "action[0] (pan) is always 1: normalising divides" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_delete_and_split_keep_every_frame(
+    kind: str, others: dict[str, Path], tmp_path: Path
+) -> None:
+    root, count = others[kind], len(KINDS[kind][1])
+    assert main(["delete", str(root), "--episodes=[1]", f"--output_dir={tmp_path / 'less'}"]) == 0
+    assert main(["check", str(tmp_path / "less")]) == 0
+    same_frames(tmp_path / "less", root, [0, *range(2, count)])
+    splits = "--splits={a: 0.6, b: 0.4}"
+    assert main(["split", str(root), splits, f"--output_dir={tmp_path}"]) == 0
+    sizes = [json.loads((tmp_path / n / d.INFO).read_text())["total_episodes"] for n in "ab"]
+    assert sum(sizes) == count
+    assert [main(["check", str(tmp_path / name)]) for name in "ab"] == [0, 0]
+
+
+def test_own_datasets_are_split_with_their_records(sound: Path, tmp_path: Path) -> None:
+    assert main(["delete", str(sound), "--episodes=[2]", f"--output_dir={tmp_path / 'a'}"]) == 0
+    assert main(["split", str(sound), f"--output_dir={tmp_path / 'b'}"]) == 0
+    for root in (tmp_path / "a", tmp_path / "b/train", tmp_path / "b/test"):
+        assert (root / d.COLLECTION).is_file()
+        assert main(["check", str(root)]) == 0
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        [],
+        ["--episodes=[9]"],
+        ["--episodes=0:4"],
+        ["--splits={a: 0.9, b: 0.9}"],
+        ["--splits={../a: 1}"],
+    ],
+)
+def test_impossible_edits_are_refused(
+    flags: list[str], others: dict[str, Path], tmp_path: Path
+) -> None:
+    command = "split" if any("splits" in flag for flag in flags) else "delete"
+    output = tmp_path / "out"
+    assert main([command, str(others["arm"]), *flags, f"--output_dir={output}"]) == 2
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "kept"),
+    [
+        (d.info(total_frames=3), [0, 1, 2, 3]),
+        (d.statistic("action", "mean", [9.0, 9.0]), [0, 1, 2, 3]),
+        (of_table(length=lambda v: v.__setitem__(1, 15)), [0, 1, 2, 3]),
+        (d.cut(d.EPISODES, 0.5), [0, 1, 2, 3]),
+        (d.remove(d.TASKS), [0, 1, 2, 3]),
+        (rows_of(d.DATA, timestamp=lambda v: v.__setitem__(12, 0.1)), [0, 2, 3]),
+        (rows_of(d.DATA, task_index=lambda v: v.__setitem__(12, 5)), [0, 2, 3]),
+    ],
+)  # fmt: skip
+def test_repair_keeps_what_is_sound(
+    damage: d.Damage, kept: list[int], others: dict[str, Path], tmp_path: Path
+) -> None:
+    root, output = Path(shutil.copytree(others["arm"], tmp_path / "copy")), tmp_path / "new"
+    damage(root)
+    report = tmp_path / "report.json"
+    assert main(["repair", str(root), f"--output_dir={output}", f"--json={report}"]) == 0
+    dropped = {problem["episode"] for problem in json.loads(report.read_text())["dropped"]}
+    assert dropped == set(range(4)) - set(kept)
+    assert main(["check", str(output)]) == 0
+    same_frames(output, others["arm"], kept)
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_repair_after_an_interrupted_recording(others: dict[str, Path], tmp_path: Path) -> None:
+    """LeRobot issues 2529 and 3522: the last data file has no footer."""
+    root, output = Path(shutil.copytree(others["chunks"], tmp_path / "copy")), tmp_path / "new"
+    last = "data/chunk-002/file-000.parquet"
+    d.cut(last, 0.8)(root)
+    assert main(["repair", str(root), f"--output_dir={output}"]) == 0
+    assert main(["check", str(output)]) == 0
+    same_frames(output, others["chunks"], [0, 1, 2, 3])
+
+
+def test_nothing_sound_leaves_no_dataset(others: dict[str, Path], tmp_path: Path) -> None:
+    root, output = Path(shutil.copytree(others["arm"], tmp_path / "copy")), tmp_path / "new"
+    d.feature("action", shape=[5], names=None)(root)
+    assert main(["repair", str(root), f"--output_dir={output}"]) == 3
+    assert not output.exists()

@@ -1,0 +1,256 @@
+"""Tasks of other packages: found, configured, checked, and refused in one line."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import egovcp.sim.config as sim_config
+import egovcp.sim.tasks.registry as registry
+from egovcp.checks import ConformanceError, check_task
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.policies import Oracle
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks import find_task, register_task, task_entries, task_names
+from tests.support.plugins import install
+
+#: A post that is always there; ``{}`` is replaced by the part of a test.
+SOURCE = '''
+import mujoco, numpy as np
+from dataclasses import dataclass
+from egovcp.sim.tasks import *
+
+@dataclass(frozen=True)
+class PostConfig(TaskConfig):
+    """A post."""
+    distance_range: Range = bounded((2.0, 3.0), least=0.5, most=9)
+    """Post before the pelvis, m."""
+
+class PostTask(Task):
+    name = "post"
+    description = "leave a post alone"
+    terms = {"touch": "block"}
+    config: PostConfig = PostConfig()
+    episode = EpisodeConfig(ticks=6, event_ticks=(1, 2), empty_probability=0.5)
+
+    def __init__(self, config, scenario, robot):
+        super().__init__(config, scenario, robot)
+        self.sample("distance")
+
+    @classmethod
+    def add_objects(cls, spec):
+        body = spec.worldbody.add_body(name="post", mocap=True, pos=[20, 0, 1])
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        body.add_geom(name="post", type=kind, size=[0.1, 1, 0], contype=1, conaffinity=0)
+
+    def place(self):
+        self.robot.data.mocap_pos[-1] = [self.parameters["distance"], 0, 1]
+
+    def rewards(self):
+        return {"touch": 0.25}
+
+    @property
+    def achieved(self):
+        return True
+
+    def state(self):
+        return ObjectState(self.robot.data.mocap_pos[-1].copy(), np.zeros(3), 0.1, True)
+'''
+ENTRY = "post = post_task:PostTask"
+
+
+@pytest.fixture
+def post(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task ``post``, installed."""
+    install(tmp_path, "post", SOURCE, ENTRY, monkeypatch)
+
+
+def changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, entry: str = ENTRY
+) -> None:
+    assert old in SOURCE
+    install(tmp_path, "post", SOURCE.replace(old, new), entry, monkeypatch)
+
+
+def play(env: VectorEnv) -> None:
+    env.reset([Scenario("post", 0, 0)])
+    env.step(np.zeros((1, 7)))
+
+
+@pytest.mark.usefixtures("post")
+def test_an_installed_task_is_found_and_has_options() -> None:
+    assert task_names() == ("ball", "wall", "arch", "sequence", "post")
+    assert task_names(training=True) == ("ball", "wall", "arch", "post")
+    assert task_entries()[-1].origin == "egovcp-task-post 1.2"
+    config = sim_config.EnvConfig()
+    assert config.post.distance_range == (2.0, 3.0)
+    assert sim_config.evaluation_config().post_episode.empty_probability == 0.0
+    assert registry.select_tasks("wall, post") == ("wall", "post")
+    assert registry.select_tasks("all") == task_names(training=True)
+
+
+@pytest.mark.usefixtures("post")
+def test_an_installed_task_plays_beside_the_others() -> None:
+    env = VectorEnv(sim_config.evaluation_config(), 2)
+    env.reset([Scenario("post", 0, 0), Scenario("ball", 0, 0)])
+    result = env.step(np.zeros((2, 7)))
+    assert result.reward_terms["touch"].tolist() == [0.25, 0.0]
+    (solid,) = env.privileged_state().solids[0]
+    assert (solid.shape, solid.size) == ("box", (0.1, 0.1, 1.0))
+    assert env.known_objects()[0, 0] == pytest.approx(env.parameters[0]["distance"], abs=0.01)
+    with pytest.raises(UsageError, match="task post has no oracle"):
+        Oracle().reset(env, [Scenario("post", 0, 0)])
+
+
+@pytest.mark.usefixtures("post")
+def test_its_random_streams_depend_on_its_name() -> None:
+    streams = {Scenario(task, 3, 5).rng("geometry").integers(10**9) for task in task_names()}
+    assert len(streams) == len(task_names())
+    assert Scenario("post", 3, 5).rng("geometry").integers(10**6) == 796876
+
+
+@pytest.mark.usefixtures("post")
+def test_a_conforming_task_is_measured() -> None:
+    report = check_task("post", episodes=2)
+    assert report.success_rate == {"random": 1.0, "hold": 1.0}
+    assert report.reward["hold"]["touch"] == 1.5
+    assert report.ms_per_step > 0.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            'self.sample("distance")',
+            'self.sample("distance"); self.parameters["x"] = float(np.random.rand())',
+            "task post, episode 0: a second run draws others",
+        ),
+        ('{"touch": 0.25}', '{"touch": 0.25 + np.random.rand()}', "reward differs"),
+        ('{"touch": 0.25}', '{"touch": 2000.0}', r"0\.04 s: reward term touch is 2000\.0"),
+        (
+            "    def rewards(self):",
+            "    @property\n    def is_over(self):\n        return True\n\n    def rewards(self):",
+            r"0\.04 s: the episode ended after 1 of 6 ticks",
+        ),
+        (
+            "    def rewards(self):",
+            "    def has_fallen(self):\n        return True\n\n    def rewards(self):",
+            "the episode ended although the robot stands",
+        ),
+        (
+            "self.robot.data.mocap_pos[-1].copy(),",
+            "np.array([1, np.nan, 0]),",
+            "position of its object",
+        ),
+    ],
+)
+def test_what_does_not_conform_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, message: str
+) -> None:
+    changed(tmp_path, monkeypatch, old, new)
+    with pytest.raises(ConformanceError, match=message):
+        check_task("post")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '{"touch": 0.25}',
+            '{"touch": float("nan")}',
+            r"its reward term touch is nan after 0\.04 s",
+        ),
+        ('{"touch": 0.25}', "{}", "its rewards are fall, pose, action_rate; expected touch,"),
+        ("size=[0.1, 1, 0]", "size=[0, 0, 0]", "its scene does not compile: .*size"),
+        (
+            "pos=[20, 0, 1])\n",
+            "pos=[20, 0, 1]); 1 / 0\n",
+            "its scene does not compile: division by zero",
+        ),
+        ('name="post", mocap', 'name="pelvis", mocap', "its scene does not compile: .*pelvis"),
+    ],
+)
+def test_a_defective_task_is_named_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, message: str
+) -> None:
+    changed(tmp_path, monkeypatch, old, new)
+    env = VectorEnv(sim_config.EnvConfig(), 1, render_depth=False)
+    found = (
+        rf"task post \(post_task:PostTask\): {message}.*; repair the class, then run egovcp-task"
+    )
+    with pytest.raises(EnvironmentFailure, match=found) as caught:
+        play(env)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "entry", "message"),
+    [
+        (
+            "import mujoco,",
+            "import moojoco,",
+            ENTRY,
+            "ModuleNotFoundError: No module named 'moojoco'",
+        ),
+        ("class PostTask", "raise SystemError\nclass PostTask", ENTRY, "SystemError"),
+        ("class PostTask", "class OtherTask", ENTRY, "has no attribute 'PostTask'"),
+        (
+            'name = "post"',
+            'name = "ball"',
+            "ball = post_task:PostTask",
+            "egovcp .* has a task of this",
+        ),
+        ('name = "post"', 'name = "camera"', "camera = post_task:PostTask", "cannot be the name"),
+        ('name = "post"', 'name = "pillar"', ENTRY, "is named 'pillar'; use one name"),
+        ("def rewards", "def payment", ENTRY, "the class lacks rewards"),
+        (
+            '"touch": "block"',
+            '"touch": "kick"',
+            ENTRY,
+            r"terms\['touch'\] is 'kick', expected one of",
+        ),
+        ("class PostTask(Task)", "class PostTask", ENTRY, "no subclass"),
+    ],
+)
+def test_a_plugin_that_cannot_be_used_is_reported_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    old: str,
+    new: str,
+    entry: str,
+    message: str,
+) -> None:
+    changed(tmp_path, monkeypatch, old, new, entry)
+    name = entry.partition(" ")[0]
+    assert task_names() == ("ball", "wall", "arch", "sequence")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"warning: task {name!r} of egovcp-task-post 1.2 cannot be used: ")
+    assert line.endswith("; repair or uninstall it")
+    if name != "ball":
+        with pytest.raises(EnvironmentFailure, match=f"egovcp-task-post 1.2.*{message}"):
+            Scenario(name, 0, 0)
+    Scenario("ball", 0, 0)
+
+
+def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "other").mkdir()
+    install(tmp_path, "post", SOURCE, "", monkeypatch)
+    assert "post" not in task_names()
+    with pytest.raises(UsageError, match=r"unknown task 'post'.*needs that package"):
+        find_task("post")
+    assert register_task("post_task:PostTask") == "post" == register_task("post_task:PostTask")
+    assert find_task("post").description == "leave a post alone"
+    monkeypatch.setattr(registry, "_found", None)  # as in a child process
+    assert find_task("post").name == "post"
+    with pytest.raises(UsageError, match=r"'post_task:Nothing' .* has no attribute"):
+        register_task("post_task:Nothing")
+
+
+def test_options_of_the_environment_are_no_names_of_tasks() -> None:
+    general = {option.name for option in fields(sim_config.BaseEnvConfig)}
+    assert general < set(registry._RESERVED)
