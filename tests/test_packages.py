@@ -115,16 +115,6 @@ def names_the_extra(result: LimitedResult) -> bool:
     return re.fullmatch(line, result.output) is not None
 
 
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_alone_a_program_shows_its_help_or_names_the_extra(program: str) -> None:
-    result = alone(program, "--help")
-    if result.exit_code == EnvironmentFailure.exit_code:
-        assert names_the_extra(result), result.output
-    else:
-        assert result.exit_code == 0, result.output
-        assert program in result.output.partition("\n")[0]
-
-
 #: Command line of a distribution that is installed alone -> the extra that it needs.
 NEED_EXTRAS = {
     "egovcp-collect --task=ball --dataset.root=out --backend=ray": "egovcp-collect[ray]",
@@ -145,6 +135,7 @@ NEED_EXTRAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", NEED_EXTRAS)
 def test_alone_a_program_refuses_work_that_needs_an_extra(
     line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

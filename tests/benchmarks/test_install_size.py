@@ -3,9 +3,12 @@
 import runpy
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks/install_size.py"
 
 
+@pytest.mark.slow
 def test_an_application_is_larger_than_the_library_and_torch_is_left_out() -> None:
     script = runpy.run_path(str(SCRIPT))
     sizes = script["sizes_mb"]()

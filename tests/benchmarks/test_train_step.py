@@ -26,6 +26,7 @@ def test_the_plain_step_has_the_same_loss(seed: int) -> None:
     torch.testing.assert_close(plain, ours, rtol=1e-4, atol=0.0)
 
 
+@pytest.mark.slow
 def test_a_given_dataset_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root, out = tmp_path / "dataset", tmp_path / "figures.json"
     writer(root, [make_episode(i, 40) for i in range(3)])

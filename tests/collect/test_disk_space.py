@@ -96,6 +96,7 @@ def small(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "--lazy", str(folder)], check=True)  # a killed worker may linger
 
 
+@pytest.mark.slow
 def test_a_collection_resumes_after_the_disk_was_full(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ _SHORT = (
 )
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_data(tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     assert main([*_SHORT, f"--dataset.root={here}", "--num_workers=1"]) == 0

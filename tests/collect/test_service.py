@@ -150,6 +150,7 @@ def test_a_killed_worker_is_replaced(
     _require_resumable(tmp_path / "cut", ten)
 
 
+@pytest.mark.slow
 def test_a_hung_worker_is_replaced(
     endless: subprocess.Popen[str], tmp_path: Path, ten: Path
 ) -> None:
@@ -163,6 +164,7 @@ def test_a_hung_worker_is_replaced(
     _require_resumable(tmp_path / "cut", ten)
 
 
+@pytest.mark.slow
 def test_a_second_collector_is_refused(
     endless: subprocess.Popen[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -187,6 +189,7 @@ def _numbers(root: Path) -> list[int]:
     return [*staged, 4 * shards - 1]
 
 
+@pytest.mark.slow
 def test_an_extended_dataset_equals_one_collected_at_once(tmp_path: Path, ten: Path) -> None:
     root = tmp_path / "grown"
     for episodes in (3, 9, 10):

@@ -145,6 +145,7 @@ def test_each_event_of_an_episode_is_logged_once(tmp_path: Path, artifact_dir: P
         assert first is None or text in first.events
 
 
+@pytest.mark.slow
 def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None:
     flags = ["--env.arch.distance_range=[0.8,0.8]", "--env.sequence.parts=[arch,ball]"]
     flags += ["--env.arch_episode.event_ticks=[2,2]", "--env.sequence.pause_ticks=5"]

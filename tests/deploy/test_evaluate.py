@@ -388,6 +388,7 @@ def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfi
     assert (score.episode, score.terminated) == (1, True)
 
 
+@pytest.mark.slow
 def test_stopped_workers_abandon_their_episodes(config: EnvConfig) -> None:
     received: list[int] = []
     groups = [EpisodeGroup("hold", (Scenario("ball", 0, number),)) for number in range(40)]

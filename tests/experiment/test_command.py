@@ -81,6 +81,7 @@ def test_a_dataset_or_policy_that_cannot_be_used_is_refused_before_any_cell_runs
     assert not (tmp_path / "out" / "logs").exists()
 
 
+@pytest.mark.slow
 def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Collects, trains and reports through the real commands; again, nothing is left to do."""
     out = tmp_path / "out"

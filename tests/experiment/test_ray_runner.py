@@ -76,6 +76,7 @@ def test_cells_run_in_order_and_a_failure_stops_only_the_cells_that_need_it(
     assert records["c"]["hardware_cores"] == os.cpu_count()
 
 
+@pytest.mark.slow
 def test_an_interrupt_stops_running_and_queued_cells(
     here: None, cell: MakeCell, tmp_path: Path, diary: Path
 ) -> None:

@@ -97,6 +97,7 @@ def run(
     return output, log
 
 
+@pytest.mark.slow
 def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) -> None:
     output, log = run
     assert re.search(r"step:2 .*kl_prior:", log)

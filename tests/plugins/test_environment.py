@@ -141,6 +141,7 @@ def test_a_rollout_of_lerobot_with_another_controller_is_refused_before_its_firs
     assert not steps
 
 
+@pytest.mark.slow
 def test_async_environments_work() -> None:
     envs = make_env(EgovcpEnvConfig(simulation=SIMULATION), n_envs=2, use_async_envs=True)
     try:

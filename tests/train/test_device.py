@@ -31,6 +31,7 @@ def _faults(mode: str) -> int:
     return int(found.stdout)
 
 
+@pytest.mark.slow
 def test_memory_that_was_freed_is_used_again_without_page_faults() -> None:
     assert _faults("keep") < 100  # of 8 MB ten times, each some thousand pages
 

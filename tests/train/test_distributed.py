@@ -50,6 +50,7 @@ def _curves(output: Path) -> dict[str, list[float]]:
     return {name: [event.value for event in events.Scalars(name)] for name in names}
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_losses_of_one_with_the_same_global_batch(
     arguments: Arguments, tmp_path: Path
 ) -> None:

@@ -53,6 +53,7 @@ def _outcome(process: multiprocessing.Process) -> int | None:
     return process.exitcode
 
 
+@pytest.mark.slow
 def test_200_steps_in_one_go_are_100_and_100_with_two_deaths_between(
     arguments: Arguments, tmp_path: Path
 ) -> None:

@@ -49,6 +49,7 @@ def test_pictures_that_fail_do_not_take_the_finished_model_with_them(
     assert _weights(output) == _weights(whole)
 
 
+@pytest.mark.slow
 def test_pictures_that_fail_in_the_middle_cost_nothing_of_what_was_to_be_saved_there(
     arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,6 +114,7 @@ def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
         torch.testing.assert_close(models[0][name], models[1][name])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nothing_ahead")
 def test_a_lost_network_ends_the_run_and_a_resumed_one_goes_on_with_the_next_batch(
     streamed: Arguments,

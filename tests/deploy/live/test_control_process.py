@@ -124,6 +124,7 @@ class Crouching(Reaching):
         return step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["stance", "walk"])
 @pytest.mark.parametrize("pause", [0.0, 2.0])
 def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -> None:

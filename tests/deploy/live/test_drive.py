@@ -167,6 +167,7 @@ def hang_up(program: subprocess.Popen[str]) -> None:
     os.killpg(program.pid, signal.SIGHUP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [kill, hang_up])
 def test_killing_the_planner_leaves_the_robot_standing_until_sigterm(
     drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
@@ -192,6 +193,7 @@ def test_killing_the_planner_leaves_the_robot_standing_until_sigterm(
     assert State.RUN in [tick.mode for tick in recording.ticks]
 
 
+@pytest.mark.slow
 def test_a_planner_exception_leaves_the_robot_standing_until_the_second_interrupt(
     drive: Callable[..., Stand],
 ) -> None:
@@ -225,6 +227,7 @@ def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand])
     assert "emergency stop" in words
 
 
+@pytest.mark.slow
 def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     drive: Callable[..., Stand],
 ) -> None:
@@ -237,6 +240,7 @@ def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     assert "no new proprioception" in words
 
 
+@pytest.mark.slow
 def test_a_missing_robot_is_reported_at_once(artifact_dir: Path, tmp_path: Path) -> None:
     result = subprocess.run(
         [
@@ -290,6 +294,7 @@ def listening(processes: Iterable[psutil.Process]) -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 def test_a_simulated_episode_is_played_and_recorded(start: Start, tmp_path: Path) -> None:
     program = start(*PATIENT, "--operator.duration=8")
     words = program.communicate(timeout=200)[1]

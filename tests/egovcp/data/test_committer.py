@@ -338,6 +338,7 @@ def _require_acknowledged(root: Path, counts: list[int]) -> None:
         assert not counts
 
 
+@pytest.mark.slow
 def test_kill_at_random_moments(tmp_path: Path) -> None:
     _kill_at_random_moments(tmp_path, 6)
 

@@ -71,6 +71,7 @@ def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick
     assert not process.is_running()
 
 
+@pytest.mark.slow
 def test_a_killed_viewer_is_reported_once(web: LiveRerun, make_tick: Any) -> None:
     warnings: list[str] = []
     sink = connection(web, warnings)
@@ -130,6 +131,7 @@ with LiveRerun("web", Viewer({address!r}), {port}) as live:
 """
 
 
+@pytest.mark.slow
 def test_no_process_survives_a_killed_run(tmp_path: Path) -> None:
     tests, ports = str(Path(__file__).parent), (free_port(), free_port())
     code = _RUN.format(tests=tests, folder=str(tmp_path), address=address(ports[0]), port=ports[1])

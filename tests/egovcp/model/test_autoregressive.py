@@ -103,6 +103,7 @@ def test_no_steps_at_all_are_refused() -> None:
         LossConfig(autoregressive_steps=0)
 
 
+@pytest.mark.slow
 def test_imagination_is_learned_without_any_kl() -> None:
     """Only the first image showed a block; the value of states imagined to the end knows it."""
     with torch.random.fork_rng(devices=[]):

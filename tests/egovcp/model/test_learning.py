@@ -52,6 +52,7 @@ def test_value_knows_what_only_memory_can_tell(remembering: WorldModel) -> None:
     assert _r2(values[:, 1:], fresh.mc_return[:, 1:]) > 0.9
 
 
+@pytest.mark.slow
 def test_without_memory_the_same_model_cannot_know() -> None:
     """The control: were this to succeed, the test above would prove nothing."""
     model, fresh = _train(forget=True), _task(128, seed=1, forget=True)

@@ -104,6 +104,7 @@ def _reward_loss(model: WorldModel, batch: Batch) -> torch.Tensor:
     return losses["reward"]
 
 
+@pytest.mark.slow
 def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
     """Reward = the action's first coordinate, in units of reward."""
     torch.manual_seed(0)

@@ -186,6 +186,7 @@ def _learn(states: int, loop: bool, gamma: float) -> Tensor:
         return model.value(carry, torch.zeros(states, 1, 7)).flatten()
 
 
+@pytest.mark.slow
 def test_rewards_beyond_every_window_are_found() -> None:
     """V(s) = gamma^(steps to the end) of a chain that ends in a failure."""
     found = _learn(states=10, loop=False, gamma=0.8)

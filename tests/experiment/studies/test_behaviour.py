@@ -56,6 +56,7 @@ def test_every_task_is_measured(task: str, key: str, flags: list[str], tmp_path:
     assert 0 < found[key]["mean"] < 1
 
 
+@pytest.mark.slow
 def test_planner_options_change_the_planner(
     flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

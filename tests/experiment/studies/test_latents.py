@@ -44,6 +44,7 @@ def test_neighbours_are_from_other_episodes() -> None:
     assert found["tick_r2"] < 0.5
 
 
+@pytest.mark.slow
 def test_every_task_is_in_the_maps(flags: list[str], tmp_path: Path) -> None:
     assert main([*flags, "--tasks=[ball,wall]", "--points=40"]) == 0
     found = read_json(tmp_path / "out" / "result.json")

@@ -62,6 +62,7 @@ def test_a_resting_walk_holds_the_last_action_of_the_plan() -> None:
         assert np.isclose(short[k], stood, rtol=1e-9).any()
 
 
+@pytest.mark.slow
 def test_the_study_measures_both_kinds_of_plans(flags: list[str], tmp_path: Path) -> None:
     few = [flag for flag in flags if not flag.startswith("--episodes")]
     walk = ["--eta=1", "--step_ticks=[5,15]"]

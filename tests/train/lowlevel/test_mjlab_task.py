@@ -13,7 +13,8 @@ from egovcp.spec import JOINT_NAMES
 from egovcp_train.lowlevel.config import DisturbanceConfig, LowLevelTask, RewardConfig
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 
-pytestmark = pytest.mark.timeout(900)  # Warp compiles its kernels once
+# Warp compiles its kernels once
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 N = 3
 PLAIN = DisturbanceConfig(

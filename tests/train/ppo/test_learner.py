@@ -139,6 +139,7 @@ def test_returns_are_those_of_whole_episodes(build: Build) -> None:
     }
 
 
+@pytest.mark.slow
 def test_it_learns_what_is_rewarded_and_exports_what_it_learned() -> None:
     torch.manual_seed(0)
     ppo = replace(PpoTrainConfig("").ppo, num_steps_per_env=8, learning_rate=3e-3, desired_kl=0.05)
