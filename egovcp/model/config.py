@@ -105,9 +105,9 @@ class WorldModelConfig:
     dynamics: Dynamics = "joint"
     """joint: train prior and posterior by the KL terms of equation 8; autoregressive: feed
     predictions back for several steps and compare them with the observations (ARWM), no KL."""
-    value_loss: ValueLoss = "two_hot"
-    """two_hot: Q is a distribution over bins of symlog returns, trained by cross-entropy; mse: Q is
-    a number, trained by its squared error."""
+    value_loss: ValueLoss = "mse"
+    """mse: Q is a number, trained by its squared error; two_hot: Q is a distribution over bins of
+    symlog returns, trained by cross-entropy, which suits noisy targets (q_target=mc)."""
     min_std: float = bounded(0.1, least=1e-6, most=10)
     """Smallest standard deviation of z."""
     update_bias: float = bounded(-1.0, least=-20, most=20)
@@ -156,6 +156,6 @@ PAPER_LOSS = LossConfig(
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(value_loss="mse", loss=PAPER_LOSS),
+    "paper": WorldModelConfig(loss=PAPER_LOSS),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

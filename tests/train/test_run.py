@@ -403,12 +403,13 @@ def test_preset_is_the_configuration_that_its_function_returns(name: str) -> Non
     assert _parsed(f"--preset={name}") == dataclasses.replace(PRESETS[name](), output_dir="x")
 
 
-def test_ablations_differ_from_the_default_in_the_loss_alone() -> None:
+def test_ablations_differ_from_the_default_in_losses_alone() -> None:
     default = _parsed()
     for name in ABLATIONS:
         config = _parsed(f"--preset={name}")
         assert config.policy.loss != default.policy.loss
-        policy = dataclasses.replace(config.policy, loss=default.policy.loss)
+        own = {"loss": default.policy.loss, "value_loss": default.policy.value_loss}
+        policy = dataclasses.replace(config.policy, **own)
         assert dataclasses.replace(config, preset="default", policy=policy) == default
 
 

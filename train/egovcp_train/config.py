@@ -54,7 +54,7 @@ class OptimizerConfig:
 class SamplingConfig:
     """Sampling of training batches."""
 
-    length: int = bounded(20, least=1, most=100_000)
+    length: int = bounded(40, least=1, most=100_000)
     """Ticks per window."""
     burn_in: int = bounded(0, least=0, most=100_000)
     """Leading ticks of a window that only fill the memory and are not trained on."""
@@ -164,13 +164,13 @@ class TrainConfig:
     """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
-    steps: int = bounded(20_000, least=1)
+    steps: int = bounded(10_000, least=1)
     """Gradient steps."""
     max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit in minutes; the learning-rate schedule then follows elapsed time instead of
     steps, so that a run is not reproducible step by step; 0: no limit. A resumed run has the rest
     of it."""
-    batch_size: int = bounded(16, least=1, most=65_536)
+    batch_size: int = bounded(32, least=1, most=65_536)
     """Windows per gradient step and process; under accelerate launch all processes together make
     one step of batch_size * num_processes windows."""
     seed: int = bounded(0, least=0)
@@ -280,14 +280,23 @@ _ABLATED_LOSSES: Final[Mapping[str, Mapping[str, Any]]] = {
     "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
     "no_near": {"proximity_weight": 0.0},
     "no_object": {"object": 0.0, "multistep_object": 0.0},
-    "monte_carlo": {"q_target": "mc"},
     "no_sampled_actions": {"sampled_actions": 0},
     "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
     "q_of_posterior_only": {"imagined_steps": 0},
 }
+
+
+def monte_carlo() -> TrainConfig:
+    """Q fitted to the returns of the recorded actions, as a distribution."""
+    loss = replace(PolicyConfig().loss, q_target="mc")
+    policy = PolicyConfig(value_loss="two_hot", loss=loss)
+    return replace(default(), preset="monte_carlo", policy=policy)
+
+
 #: Ablations of the loss, as `egovcp-experiment ablations` compares them.
 ABLATIONS: Final[Mapping[str, Callable[[], TrainConfig]]] = {
-    name: _ablation(name, **loss) for name, loss in _ABLATED_LOSSES.items()
+    "monte_carlo": monte_carlo,
+    **{name: _ablation(name, **loss) for name, loss in _ABLATED_LOSSES.items()},
 }
 #: Name -> function that returns the complete configuration.
 PRESETS: Final[Mapping[str, Callable[[], TrainConfig]]] = {

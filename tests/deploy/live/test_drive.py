@@ -126,6 +126,7 @@ def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Call
     fake.close()
 
 
+@pytest.mark.slow
 def test_a_run_stands_up_runs_holds_and_leaves_the_motors_damped(
     drive: Callable[..., Stand],
 ) -> None:
