@@ -87,7 +87,7 @@ class Stand:
 
     def end(self) -> str:
         """Its last words."""
-        return self.program.communicate(timeout=120)[1]
+        return self.program.communicate(timeout=240)[1]
 
 
 @pytest.fixture
