@@ -221,7 +221,7 @@ class RecordingReader:
                 return without_checksum(record.metadata)
         raise DataError(
             f"{self._path}: its metadata record {METADATA_NAME!r} is damaged or missing; expected "
-            "a recording of egovcp"
+            "a recording of egovcp (others: egovcp-mcap to-dataset --mapping=FILE)"
         )
 
 

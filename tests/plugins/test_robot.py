@@ -26,7 +26,14 @@ from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from lerobot_robot_egovcp import EgovcpG1, EgovcpG1Config
 
 #: A test is about the wire, not about how busy this machine is.
-PATIENT = Limits(stand_s=0.5, planner_hold_s=5.0, misses_hold=1000, image_hold_s=5.0)
+PATIENT = Limits(
+    state_hold_s=5.0,
+    state_damp_s=10.0,
+    image_hold_s=5.0,
+    planner_hold_s=5.0,
+    misses_hold=1000,
+    stand_s=0.5,
+)
 
 
 def config(tmp_path: Path, bridge: int = 1, command: int = 1, camera: int = 1) -> EgovcpG1Config:

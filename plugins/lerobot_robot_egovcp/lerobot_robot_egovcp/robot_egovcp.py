@@ -35,8 +35,8 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     limits: Limits = field(default_factory=Limits)
     """Limits at which the robot holds its pose or its motors are damped."""
     suffix: str = ""
-    """Ending of the names of states and actions: ``.vel`` for lerobot-rollout, which passes a policy
-    only values that are named ``*.pos`` or ``*.vel``."""
+    """Ending of the names of states and actions: ``.vel`` for lerobot-rollout, which passes a
+    policy only values that are named ``*.pos`` or ``*.vel``."""
     by_itself: bool = False
     """Whether `connect` makes the robot stand up, arm and run, for egovcp-fake-g1. Else use its
     remote control: Y, A, start."""
