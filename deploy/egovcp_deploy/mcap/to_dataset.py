@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import shlex
 from collections import deque
@@ -84,6 +85,7 @@ def run(config: ToDatasetConfig) -> None:
 def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) -> None:
     """Convert recordings of other programs; raises as `run`."""
     require_packages("egovcp-deploy", "--mapping", *DATA_MODULES, "lerobot")
+    logging.getLogger("lerobot").setLevel(logging.ERROR)  # a page where torchcodec lacks FFmpeg
     from lerobot.datasets import LeRobotDataset
 
     from egovcp.data.writer import new_dataset
@@ -101,13 +103,12 @@ def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) 
         dataset, shapes = None, dict[str, tuple[int, ...]]()
         for recording, kept, gap in recordings:
             for row in islice(recording.rows(shapes), kept):
-                dataset = dataset or LeRobotDataset.create(
-                    config.dataset.repo_id or root.name,
-                    mapping.fps,
-                    _features(row, mapping),
-                    folder,
-                    use_videos=mapping.video,
-                )
+                if dataset is None:  # an empty one is false
+                    features = _features(row, mapping)
+                    name, videos = config.dataset.repo_id or root.name, mapping.video
+                    dataset = LeRobotDataset.create(
+                        name, mapping.fps, features, folder, use_videos=videos
+                    )
                 dataset.add_frame({**row, "task": mapping.task})
             dataset.save_episode()
             echo(f"{recording.path}: {kept} rows{f', cut: {gap}' if gap else ''}")

@@ -76,7 +76,8 @@ class TopicMapping:
             if found.fps < 1 or not found.features or not found.task:
                 raise ValueError("expected fps of at least 1, a task, and features")
         except (OSError, UnsafeFileError, ValueError, UsageError) as error:
-            raise UsageError(f"--mapping={path}: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            raise UsageError(f"--mapping={path}: {reason}") from error
         return found
 
 
