@@ -100,7 +100,8 @@ def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) 
                 "hold may pause"
             )
     with new_dataset(root) as folder:
-        dataset, shapes = None, dict[str, tuple[int, ...]]()
+        dataset: Any = None
+        shapes: dict[str, tuple[int, ...]] = {}
         for recording, kept, gap in recordings:
             for row in islice(recording.rows(shapes), kept):
                 if dataset is None:  # an empty one is false

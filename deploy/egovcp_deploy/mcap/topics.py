@@ -239,7 +239,7 @@ def _values(value: Any) -> Array:
     return numbers if numbers.dtype == np.bool_ else numbers.astype(np.float32)
 
 
-def _numbers(value: Any) -> Iterator[float]:
+def _numbers(value: Any) -> Iterator[Any]:
     if isinstance(value, bool | int | float | np.number):
         yield value
     elif isinstance(value, str) or value is None:
@@ -263,8 +263,8 @@ def _image(fields: Mapping[str, Any]) -> Array:
     encoding, rows, columns = fields["encoding"], fields["height"], fields["width"]
     if encoding not in _PIXELS:
         raise ValueError(f"encoding {encoding!r}; expected one of {', '.join(_PIXELS)}")
-    kind, channels, order = _PIXELS[encoding]
-    kind = np.dtype(kind).newbyteorder(">" if fields.get("is_bigendian") else "<")
+    name, channels, order = _PIXELS[encoding]
+    kind = np.dtype(name).newbyteorder(">" if fields.get("is_bigendian") else "<")
     used = columns * channels * kind.itemsize
     lines = np.frombuffer(data, np.uint8).reshape(rows, fields.get("step") or used)
     pixels = lines[:, :used].copy().view(kind).reshape(rows, columns, channels)[..., order]
