@@ -26,6 +26,7 @@ from egovcp.data.schema import INDEX_FEATURES
 from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError
 from egovcp.flags import read_config
+from egovcp.log.mcap_reader import require_mcap
 from egovcp.rate import NS_PER_S
 from egovcp.values import build
 
@@ -88,6 +89,7 @@ class TopicRecording:
     def __init__(self, path: Path, mapping: TopicMapping) -> None:
         """Read the times of all messages; raises `DataError` if the file is damaged, or lacks a
         topic, or one is too slow."""
+        require_mcap(path)
         self.path, self._fps = path, mapping.fps
         times: dict[str, list[int]] = {}
         for _, channel, message in self._messages(None):
