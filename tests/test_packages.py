@@ -130,6 +130,7 @@ NEED_EXTRAS = {
     "egovcp-task check ball": "egovcp-deploy[sim]",
     "egovcp-train --dataset.root=data --output_dir=out --eval_closed_loop=1": "egovcp-train[sim]",
     "egovcp-train --dataset.root=data --output_dir=out --wandb.enable": "egovcp-train[wandb]",
+    "egovcp-train --dataset.root=data --output_dir=out --trackio=mine": "egovcp-train[trackio]",
     "egovcp-train-lowlevel --output_dir=out": "egovcp-train[lowlevel]",
     "egovcp-train-ppo --task=ball --output_dir=out": "egovcp[sim]",
 }

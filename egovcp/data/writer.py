@@ -13,8 +13,8 @@ import errno
 import json
 import secrets
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, Final, Self
@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from egovcp import spec
 from egovcp.data import files, schema, stats
-from egovcp.data.destination import is_vacant, make_parent, require_new, resolve_root
+from egovcp.data.destination import is_vacant, make_parent, require_new, resolve_root, writer_lock
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
 from egovcp.data.staging import EncodedEpisode, encode, with_index
@@ -282,6 +282,22 @@ def publish_version(folder: Path, root: Path, replace: bool = False) -> None:
             ) from error
         raise
     files.sync(root.parent)
+
+
+@contextmanager
+def new_dataset(root: Path) -> Iterator[Path]:
+    """A folder that becomes the new dataset ``root`` at the end of the block, unless it raises."""
+    work = root.with_name(f".{root.name}.new")
+    work.mkdir(parents=True, exist_ok=True)
+    folder = work / "dataset"
+    with writer_lock(root, work):
+        shutil.rmtree(folder, ignore_errors=True)  # of a killed command
+        try:
+            yield folder
+            files.sync_tree(folder)
+            publish_version(folder, root)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def _exchange(folder: Path, root: Path) -> None:

@@ -117,7 +117,7 @@ class RecordingReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        _require_mcap(path)
+        require_mcap(path)
         self._file = RecordFile(path)
         self.complete = False
         """Whether `raw_ticks` has read the whole file without damage."""
@@ -221,7 +221,7 @@ class RecordingReader:
                 return without_checksum(record.metadata)
         raise DataError(
             f"{self._path}: its metadata record {METADATA_NAME!r} is damaged or missing; expected "
-            "a recording of egovcp"
+            "a recording of egovcp (others: egovcp-mcap to-dataset --mapping=FILE)"
         )
 
 
@@ -236,7 +236,7 @@ def _loss(ticks: int, last: RawTick | None, following: RawTick | None, start_ns:
     return Loss(ticks, place)
 
 
-def _require_mcap(path: Path) -> None:
+def require_mcap(path: Path) -> None:
     """Raise `DataError` for a file that neither starts nor ends with the MCAP magic bytes."""
     try:
         with open_regular(path) as file:  # a FIFO would block

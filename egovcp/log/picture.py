@@ -165,6 +165,16 @@ def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
     axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
 
 
+def grey_image(depth_m: NDArray[np.floating], magnify: int = 4) -> NDArray[np.uint8]:
+    """Depth (H, W) in m as an image (H * magnify, W * magnify, 3): near is bright, invalid black.
+
+    Video encoders need more than 64 columns.
+    """
+    near = np.where(depth_m == 0, 0.0, 255.0 * (1.0 - depth_m / DEPTH_MAX_M))
+    grey = near.clip(0, 255).astype(np.uint8).repeat(magnify, 0).repeat(magnify, 1)
+    return np.stack([grey] * 3, -1)
+
+
 def curves(ticks: Sequence[Tick]) -> Curves:
     """Curve name -> value per tick; curves without any value are left out."""
     known: Curves = {

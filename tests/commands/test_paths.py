@@ -117,6 +117,7 @@ CASES = {
 }
 #: The same of commands that take further paths, depending on other options.
 MORE = (
+    ("egovcp-mcap to-dataset", "RECORDING --dataset.root=NEW", ("mapping",), ()),
     (
         "egovcp-deploy",
         f"--policy.path=POLICY --output_dir=NEW --robot.type=replay {STANCE}",
@@ -144,7 +145,7 @@ INPUTS = (
 VALID = {
     *(("file", "recording.mcap"), ("files", "recording.mcap"), ("config_path", "empty")),
     *(("records", ""), ("train.policies", "empty/below"), ("robot.recordings", "recording.mcap")),
-    ("constant.path", ""),
+    *(("constant.path", ""), ("mapping", "")),
 }
 OUTPUTS = ("loop", "empty/below", "x" * 300, "/proc/new", "/dev/null/new", "\udcff", "a\0b", "fifo")
 

@@ -22,15 +22,17 @@ from egovcp.entry_point import EntryPoint
 from egovcp.flags import flags_of
 from lerobot_env_egovcp import EgovcpEnvConfig
 from lerobot_policy_egovcp import EgovcpConfig
+from lerobot_robot_egovcp import EgovcpG1Config
 
 ROOT = Path(__file__).resolve().parents[2]
 #: LeRobot's commands that read their options into a dataclass -> that class.
 _LEROBOT_CONFIGS = {
     "lerobot-eval": "lerobot.configs.eval:EvalPipelineConfig",
+    "lerobot-rollout": "lerobot.rollout:RolloutConfig",
     "lerobot-train": "lerobot.configs.train:TrainPipelineConfig",
 }
 #: Packages of others that are installed by name.
-_PACKAGES = {"uv", "wandb"}
+_PACKAGES = {"trackio", "uv", "wandb"}
 
 
 class WrongCommand(Exception):
@@ -79,6 +81,7 @@ def known_flags() -> frozenset[str]:
             found |= set(re.findall(r"--[\w.-]+", _help(point.name)))
     found |= {flag.replace("--", "--policy.", 1) for flag in flags_of(EgovcpConfig)}
     found |= {flag.replace("--", "--env.", 1) for flag in flags_of(EgovcpEnvConfig)}
+    found |= {flag.replace("--", "--robot.", 1) for flag in flags_of(EgovcpG1Config)}
     for script in (ROOT / "benchmarks").glob("*.py"):
         text = script.read_text(encoding="utf-8")
         found |= set(re.findall(r'"(--[\w.-]+)"', text))

@@ -47,6 +47,7 @@ _ELSEWHERE = {
     "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",
     "egovcp-dataset audit": "tests/collect/dataset/test_audit.py",
+    "--mapping": "tests/deploy/mcap/test_topics.py",
     "egovcp-task": "tests/deploy/test_task.py",
     "--task=bag": "tests/test_examples.py",
     "data/bag": "tests/test_examples.py",

@@ -53,6 +53,24 @@ def test_actions_are_those_of_the_artifact(artifact: Path, robots: int) -> None:
         np.testing.assert_array_equal(policy.select_action(_batch(depth, state)), expected)
 
 
+def test_the_predicted_video_is_what_the_first_robot_imagines(artifact: Path) -> None:
+    policy = EgovcpPolicy.from_pretrained(artifact)
+    policy.config.save_predicted_video = True
+    plain = load_artifact(str(artifact)).make_policy(num_envs=2)
+    latents = []
+    for depth, state in _observations(2, ticks=3):
+        policy.select_action(_batch(depth, state))
+        latents.append(policy.last_predicted_latents)
+        step = plain.act(depth, state)
+        ahead = plain.imagine(step.plan, 16)[0]
+        expected = np.hstack([plain.reconstruct()[0], *ahead[[3, 7, 15]]])
+        np.testing.assert_array_equal(latents[-1][0, 0, 0], expected)
+        plain.advance(step.action)
+    frames = policy.decode_predicted_latents(torch.cat(latents, dim=2))
+    assert frames.shape == (3, 4 * spec.DEPTH_ROWS, 4 * 4 * spec.DEPTH_COLS, 3)
+    assert frames.any()
+
+
 def test_make_policy_and_the_processors_give_the_same_actions(
     artifact: Path, meta: LeRobotDatasetMetadata
 ) -> None:

@@ -9,11 +9,14 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from huggingface_hub import HfApi
 
+from egovcp import spec
 from egovcp.artifact import load_artifact
 from egovcp.checks import check_artifact
+from egovcp.data.pictures import decode_frames
 from egovcp.manifest import PROCESSORS
 from egovcp.robot.stance import StanceController
 from lerobot_policy_egovcp import EgovcpPolicy
@@ -147,6 +150,7 @@ def test_lerobot_eval_plays_it_from_the_hub(surroundings: dict[str, str], tmp_pa
         "eval",
         f"--policy.path={POLICY}",
         "--policy.device=cpu",
+        "--policy.save_predicted_video=true",
         "--env.type=egovcp",
         "--env.task=ball",
         "--env.simulation.controller=stance",
@@ -158,4 +162,7 @@ def test_lerobot_eval_plays_it_from_the_hub(surroundings: dict[str, str], tmp_pa
     )
     result = json.loads((tmp_path / "eval_info.json").read_text())
     assert result["overall"]["n_episodes"] == 2
-    assert len(list(tmp_path.rglob("*.mp4"))) == 2
+    assert len(list(tmp_path.rglob("eval_episode_*.mp4"))) == 2
+    (predicted,) = result["overall"]["predicted_video_paths"]
+    frames = decode_frames(Path(predicted), np.arange(6) / spec.PLANNER_HZ)
+    assert {(frame.height, frame.width) for frame in frames} == {(4 * 48, 4 * 4 * 64)}

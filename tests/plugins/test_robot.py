@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lerobot.robots import RobotConfig, make_robot_from_config
+from lerobot.scripts import lerobot_rollout
 from lerobot.utils.errors import DeviceNotConnectedError
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 
@@ -23,7 +26,14 @@ from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from lerobot_robot_egovcp import EgovcpG1, EgovcpG1Config
 
 #: A test is about the wire, not about how busy this machine is.
-PATIENT = Limits(stand_s=0.5, planner_hold_s=5.0, misses_hold=1000, image_hold_s=5.0)
+PATIENT = Limits(
+    state_hold_s=5.0,
+    state_damp_s=10.0,
+    image_hold_s=5.0,
+    planner_hold_s=5.0,
+    misses_hold=1000,
+    stand_s=0.5,
+)
 
 
 def config(tmp_path: Path, bridge: int = 1, command: int = 1, camera: int = 1) -> EgovcpG1Config:
@@ -129,3 +139,38 @@ def test_it_is_driven_with_seven_numbers(fake: EgovcpG1Config) -> None:
     finally:
         robot.disconnect()
     assert not robot.is_connected
+
+
+@pytest.mark.slow
+def test_lerobot_rollout_plays_a_policy_on_it(
+    fake: EgovcpG1Config, artifact: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[dict[str, float]] = []
+    send = EgovcpG1.send_action
+
+    def recorded(robot: EgovcpG1, action: dict[str, float]) -> dict[str, float]:
+        sent.append(action)
+        taken: dict[str, float] = send(robot, action)
+        return taken
+
+    monkeypatch.setattr(EgovcpG1, "send_action", recorded)
+    options = {
+        "policy.path": artifact,
+        "policy.device": "cpu",
+        "robot.type": "egovcp_g1",
+        "robot.suffix": ".vel",
+        "robot.by_itself": "true",
+        "robot.calibration_dir": fake.calibration_dir,
+        "robot.bridge.state_port": fake.bridge.state_port,
+        "robot.bridge.command_port": fake.bridge.command_port,
+        "robot.camera.server.port": fake.camera.server.port,
+        "robot.controller": fake.controller,
+        "robot.limits": json.dumps(asdict(fake.limits)),
+        "fps": spec.PLANNER_HZ,
+        "duration": 2,
+    }
+    argv = ["lerobot-rollout", *(f"--{name}={value}" for name, value in options.items())]
+    monkeypatch.setattr(sys, "argv", argv)
+    lerobot_rollout.main()
+    assert len(sent) > 1
+    assert all(list(action) == [f"{name}.vel" for name in spec.ACTION_NAMES] for action in sent)

@@ -155,15 +155,40 @@ def test_scalars_pictures_and_the_policy_go_there_and_a_resumed_run_goes_on(
     assert wandb.runs[-1].artifacts == []
 
 
+def test_trackio_has_scalars_and_pictures_and_a_resumed_run_goes_on(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, run, output = list[tuple[str, str, str]](), _Run(""), tmp_path / "run"
+
+    def init(project: str, name: str, config: dict[str, Any], resume: str) -> _Run:
+        started.append((project, name, resume))
+        return run
+
+    fake: Any = SimpleNamespace(init=init, Image=np.asarray)
+    fake.__spec__ = ModuleSpec("trackio", None)
+    monkeypatch.setitem(sys.modules, "trackio", fake)
+    assert main(arguments(output, "--trackio=hands")) == 0
+    assert main([f"--output_dir={output}", "--resume", "--steps=8"]) == 0
+    assert started == [("hands", "run", "never"), ("hands", "run", "allow")]
+    logged = [(name, step) for step, values in run.logged for name in values]
+    assert {("loss/total", 6), ("heldout/value_ball", 6), ("loss/total", 8)} <= set(logged)
+    assert run.finished
+
+
+@pytest.mark.parametrize(
+    ("package", "flag"), [("wandb", "--wandb.enable"), ("trackio", "--trackio=hands")]
+)
 def test_without_the_package_it_is_refused_before_anything_is_written(
     arguments: Arguments,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
+    package: str,
+    flag: str,
 ) -> None:
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    assert main(arguments(tmp_path / "run", "--wandb.enable")) == 5
-    assert "pip install 'egovcp-train[wandb]'" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main(arguments(tmp_path / "run", flag)) == 5
+    assert f"pip install 'egovcp-train[{package}]'" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

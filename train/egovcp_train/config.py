@@ -196,6 +196,8 @@ class TrainConfig:
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)
     """Weights & Biases."""
+    trackio: str = ""
+    """Also record to this project of Trackio, on this machine (`trackio show`); empty: do not."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:

@@ -1,4 +1,4 @@
-"""Scalars, images and the policy of a run, recorded to TensorBoard and Weights & Biases."""
+"""Scalars, images and the policy of a run, recorded to TensorBoard, Weights & Biases, Trackio."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.packages import require_packages
 
 RUN_ID: Final = "wandb/run_id.txt"
 
@@ -34,12 +33,6 @@ class WandbConfig:
     """offline: keep the records below OUTPUT_DIR/wandb for `wandb sync`."""
     disable_artifact: bool = False
     """Do not upload the finished policy."""
-
-
-def require_wandb(config: WandbConfig) -> None:
-    """Raise `MissingPackage` if the package is needed and not installed."""
-    if config.enable:
-        require_packages("egovcp-train", "--wandb.enable", "wandb")
 
 
 class TensorBoardRecorder:
@@ -73,7 +66,34 @@ class TensorBoardRecorder:
             self._writer.close()
 
 
-class WandbRecorder:
+class TrackioRecorder:
+    """Records to a run of the local Trackio, whose package has the functions of wandb."""
+
+    def __init__(self, output: Path, project: str, options: Mapping[str, Any]) -> None:
+        """Start the run, or continue that of the same folder name; see `WandbRecorder`."""
+        import trackio  # an optional package
+
+        self._package = trackio
+        resume = "allow" if options["resume"] else "never"
+        self._run = trackio.init(project, output.name, config=dict(options), resume=resume)
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Record one value per name at ``step``."""
+        self._run.log(dict(values), step=step)
+
+    def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Record an image (height, width, 3) at ``step``."""
+        self._run.log({name: self._package.Image(pixels)}, step=step)
+
+    def policy(self, step: int, folder: Path) -> None:
+        """Nothing: the policy stays in the output folder."""
+
+    def close(self) -> None:
+        """Send the remaining records."""
+        self._run.finish()
+
+
+class WandbRecorder(TrackioRecorder):
     """Records to one run of Weights & Biases; a resumed training continues it."""
 
     def __init__(self, output: Path, config: WandbConfig, options: Mapping[str, Any]) -> None:
@@ -108,35 +128,23 @@ class WandbRecorder:
                 f"wandb: {' '.join(str(error).split())[:200]}; see `wandb login`, or choose "
                 "--wandb.mode=offline"
             ) from error
-        self._wandb, self._config = wandb, config
+        self._package, self._config = wandb, config
         stored.parent.mkdir(parents=True, exist_ok=True)
         stored.write_text(self._run.id, encoding="utf-8")
-
-    def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Record one value per name at ``step``."""
-        self._run.log(dict(values), step=step)
-
-    def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
-        """Record an image (height, width, 3) at ``step``."""
-        self._run.log({name: self._wandb.Image(pixels)}, step=step)
 
     def policy(self, step: int, folder: Path) -> None:
         """Upload the finished policy, unless that is disabled."""
         if self._config.disable_artifact:
             return
-        artifact = self._wandb.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
+        artifact = self._package.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
         artifact.add_dir(str(folder))
         self._run.log_artifact(artifact)
-
-    def close(self) -> None:
-        """Send the remaining records."""
-        self._run.finish()
 
 
 class Records:
     """All recorders of a run."""
 
-    def __init__(self, recorders: Sequence[TensorBoardRecorder | WandbRecorder]) -> None:
+    def __init__(self, recorders: Sequence[TensorBoardRecorder | TrackioRecorder]) -> None:
         self._recorders = tuple(recorders)
 
     def __bool__(self) -> bool:

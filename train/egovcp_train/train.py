@@ -22,6 +22,7 @@ from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
+from egovcp.packages import require_packages
 from egovcp.plan.backends import make_evaluator
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
@@ -54,7 +55,7 @@ from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.publish import publish_trained, reserve_policy, versions, write_card
-from egovcp_train.records import Records, TensorBoardRecorder, WandbRecorder, require_wandb
+from egovcp_train.records import Records, TensorBoardRecorder, TrackioRecorder, WandbRecorder
 
 PROG = "egovcp-train"
 EPILOG = "Options not listed here are set by --preset; the file of --config_path can override them."
@@ -310,7 +311,9 @@ class TrainingRun:
 
 def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
     """Check packages, sizes and folders before any work starts; returns the output folder."""
-    require_wandb(config.wandb)
+    for flag, wanted in (("wandb.enable", config.wandb.enable), ("trackio", config.trackio)):
+        if wanted:
+            require_packages("egovcp-train", f"--{flag}", flag.partition(".")[0])
     try:
         tensor_shapes(config.policy.world_model())
     except ValueError as error:
@@ -326,11 +329,13 @@ def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
 
 
 def _records(config: TrainConfig, output: Path) -> Records:
-    found: list[TensorBoardRecorder | WandbRecorder] = []
+    found: list[TensorBoardRecorder | TrackioRecorder] = []
     if config.tensorboard:
         found.append(TensorBoardRecorder(output, enabled=True))
     if config.wandb.enable:
         found.append(WandbRecorder(output, config.wandb, draccus.encode(config)))
+    if config.trackio:
+        found.append(TrackioRecorder(output, config.trackio, draccus.encode(config)))
     return Records(found)
 
 

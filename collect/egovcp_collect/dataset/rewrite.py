@@ -20,6 +20,7 @@ from egovcp.data.destination import require_new, resolve_root
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
+from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines, one_line
@@ -31,7 +32,7 @@ from egovcp_collect.dataset.record_index import (
     require_one_controller,
 )
 from egovcp_collect.dataset.recovery import RecoveredEpisode, recover_episodes
-from egovcp_collect.dataset.subset import EpisodeScan, SubsetWriter, new_dataset
+from egovcp_collect.dataset.subset import EpisodeScan, SubsetWriter
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -23,12 +22,11 @@ from numpy.typing import NDArray
 from egovcp.checks.feature_statistics import Statistics, aggregate, describe
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import files, schema
-from egovcp.data.destination import writer_lock
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
 from egovcp.data.stats import QUANTILES
-from egovcp.data.writer import publish_version
+from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError
 
 _SAMPLED_FRAMES: Final = 20  # for the statistics of a camera that are not recorded
@@ -138,22 +136,6 @@ def _rebuilt_spans(reader: LeRobotReader) -> dict[int, dict[str, VideoSpan]]:
             for number, span in placed.items():
                 spans.setdefault(number, {})[key] = span
     return {n: found for n, found in spans.items() if len(found) == len(videos)}
-
-
-@contextmanager
-def new_dataset(root: Path) -> Iterator[Path]:
-    """A folder that becomes the new dataset ``root`` at the end of the block, unless it raises."""
-    work = root.with_name(f".{root.name}.new")
-    work.mkdir(parents=True, exist_ok=True)
-    folder = work / "dataset"
-    with writer_lock(root, work):
-        shutil.rmtree(folder, ignore_errors=True)  # of a killed command
-        try:
-            yield folder
-            files.sync_tree(folder)
-            publish_version(folder, root)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
 
 
 class SubsetWriter:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import shlex
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from egovcp.cli import DatasetConfig
 from egovcp.errors import DataError, UsageError
@@ -21,7 +23,9 @@ from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
     from egovcp.data import Episode, Provenance
+    from egovcp_deploy.mcap.topics import Array, TopicMapping
 
+_IMAGE_NAMES = ["height", "width", "channels"]
 _PER_EPISODE = ("pose", "dataset", "index in the dataset", "scenario", "time_limit", "command")
 
 
@@ -38,6 +42,9 @@ class ToDatasetConfig:
     """The recordings, MCAP files."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The new dataset; without a root, it is written to LeRobot's local folder under its id."""
+    mapping: str = ""
+    """For recordings of other programs: a YAML or JSON file that maps their topics to features of
+    a dataset, see docs/logs.md."""
     gaps: Literal["refuse", "cut"] = "refuse"
     """How to treat a recording with missing ticks, since rows of an episode are one period apart.
     refuse: fail; cut: keep the ticks before the first gap (not those after it, since an episode
@@ -62,6 +69,9 @@ def run(config: ToDatasetConfig) -> None:
     paths = [Path(os.path.expanduser(file)) for file in config.files]
     root = resolve_root(local_root(config.dataset))
     require_new(root)
+    if config.mapping:
+        _convert_topics(config, paths, root)
+        return
     common = provenance(paths)
     require_different(paths, config.gaps)
     with DatasetWriter(root, common) as writer:
@@ -70,6 +80,58 @@ def run(config: ToDatasetConfig) -> None:
             writer.add(episode)
             echo(f"{path}: {len(episode)} ticks{cut}")
     echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
+
+
+def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) -> None:
+    """Convert recordings of other programs; raises as `run`."""
+    require_packages("egovcp-deploy", "--mapping", *DATA_MODULES, "lerobot")
+    logging.getLogger("lerobot").setLevel(logging.ERROR)  # a page where torchcodec lacks FFmpeg
+    from lerobot.datasets import LeRobotDataset
+
+    from egovcp.data.writer import new_dataset
+    from egovcp_deploy.mcap.topics import TopicMapping, TopicRecording
+
+    mapping = TopicMapping.read(Path(os.path.expanduser(config.mapping)))
+    recordings = [(r, *r.gap()) for r in (TopicRecording(path, mapping) for path in paths)]
+    for recording, kept, gap in recordings:
+        if gap and (config.gaps == "refuse" or kept == 0):
+            raise DataError(
+                f"{recording.path}: {gap}; --gaps=cut keeps the rows before, and a topic under "
+                "hold may pause"
+            )
+    with new_dataset(root) as folder:
+        dataset: Any = None
+        shapes: dict[str, tuple[int, ...]] = {}
+        for recording, kept, gap in recordings:
+            for row in islice(recording.rows(shapes), kept):
+                if dataset is None:  # an empty one is false
+                    features = _features(row, mapping)
+                    name, videos = config.dataset.repo_id or root.name, mapping.video
+                    dataset = LeRobotDataset.create(
+                        name, mapping.fps, features, folder, use_videos=videos
+                    )
+                dataset.add_frame({**row, "task": mapping.task})
+            dataset.save_episode()
+            echo(f"{recording.path}: {kept} rows{f', cut: {gap}' if gap else ''}")
+        dataset.finalize()
+        echo(f"{root}: {dataset.num_episodes} episodes, {dataset.num_frames} frames")
+
+
+def _features(row: Mapping[str, Array], mapping: TopicMapping) -> dict[str, Any]:
+    """LeRobot's description of the features of a row."""
+    image = {"dtype": "video" if mapping.video else "image", "names": _IMAGE_NAMES}
+    found: dict[str, Any] = {}
+    for key, value in row.items():
+        names = mapping.names.get(key)
+        if value.ndim == 3:
+            found[key] = {"shape": value.shape, **image}
+            if value.dtype == "uint16":
+                found[key]["info"] = {"is_depth_map": True}
+        elif names and len(names) != len(value):
+            raise UsageError(f"names.{key} of the mapping: {len(names)} of {len(value)} values")
+        else:
+            found[key] = {"dtype": str(value.dtype), "shape": value.shape, "names": names}
+    return found
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:

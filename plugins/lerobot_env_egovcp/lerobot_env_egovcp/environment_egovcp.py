@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
+from egovcp.log.picture import grey_image
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.gym import EgovcpEnv, GymObservation
-
-_GREY_PER_MM = 255 / (spec.DEPTH_MAX_M * 1e3)
-_MAGNIFY = 4  # video encoders need more than 64 columns
 
 
 class LeRobotEgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
@@ -61,9 +59,7 @@ class LeRobotEgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8]:
         """The depth image as (192, 256, 3): near is bright, black is invalid."""
-        near = np.where(self._depth == 0, 0.0, 255.0 - self._depth * _GREY_PER_MM)
-        grey = near.clip(0, 255).astype(np.uint8).repeat(_MAGNIFY, 0).repeat(_MAGNIFY, 1)
-        return np.stack([grey] * 3, -1)
+        return grey_image(self._depth / 1e3)
 
     def close(self) -> None:
         self._env.close()

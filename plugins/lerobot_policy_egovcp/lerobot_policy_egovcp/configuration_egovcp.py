@@ -39,6 +39,9 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     """Planner that turns the world model into actions."""
     planner_seed: int = 0
     """Seed of the planner's samples; `reset` restarts them."""
+    save_predicted_video: bool = False
+    """lerobot-eval writes ``pred_episode_N.mp4`` beside its videos: the depth image of the first
+    robot reconstructed, and imagined 4, 8 and 16 steps ahead."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
     sequence_length: int = 20

@@ -15,12 +15,14 @@ from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.artifact import CONFIG, Artifact, load_artifact, write_artifact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.log.picture import grey_image
 from egovcp.manifest import FORMAT_KEYS
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.plan import Policy
@@ -36,6 +38,7 @@ from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
 type Stats = Mapping[str, Mapping[str, Any]]
 
 _LOG: Final = logging.getLogger(__name__)
+_AHEAD: Final = (4, 8, 16)  # steps from an observation to the imagined images of the video
 _PREFIX = "world_model."
 
 
@@ -65,6 +68,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._targets: RowTargets | None = None
         self._provenance = _provenance(self._reader)
         self._planner: Policy | None = None
+        self.last_predicted_latents: Tensor | None = None
         if self._reader is not None and dataset_stats is not None:
             state = dataset_stats[spec.STATE_KEY]
             returns = self._dataset_targets().usable.numpy()
@@ -148,6 +152,10 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         planner = self._planner_for(len(state))
         before = planner.skipped
         step = planner.act(depth, state)
+        if self.config.save_predicted_video:
+            ahead = planner.imagine(step.plan, max(_AHEAD))[0]
+            images = [planner.reconstruct()[0], *(ahead[k - 1] for k in _AHEAD)]
+            self.last_predicted_latents = torch.from_numpy(np.hstack(images))[None, None, None]
         planner.advance(step.action)
         if (robots := (step.skipped & ~before).nonzero()[0]).size:
             _LOG.warning(
@@ -156,6 +164,16 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 spec.STATE_KEY,
             )
         return torch.from_numpy(step.plan).to(batch[spec.STATE_KEY].device)
+
+    @staticmethod
+    def decode_predicted_latents(latents: Tensor) -> NDArray[np.uint8]:
+        """Frames (T, H, W, 3) of a rollout, for lerobot-eval, which joins along T what it finds in
+        ``last_predicted_latents`` after each step.
+
+        Args:
+            latents: decoded depth images (1, 1, T, h, w) in m.
+        """
+        return np.stack([grey_image(depth) for depth in latents[0, 0].numpy()])
 
     def _require_controller(self, info: object) -> None:
         found = info.get(spec.CONTROLLER_ID_KEY) if isinstance(info, Mapping) else None

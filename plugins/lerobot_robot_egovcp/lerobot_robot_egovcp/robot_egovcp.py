@@ -34,6 +34,9 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     """Low-level controller: walk, stance, or the file of a trained one."""
     limits: Limits = field(default_factory=Limits)
     """Limits at which the robot holds its pose or its motors are damped."""
+    suffix: str = ""
+    """Ending of the names of states and actions: ``.vel`` for lerobot-rollout, which passes a
+    policy only values that are named ``*.pos`` or ``*.vel``."""
     by_itself: bool = False
     """Whether `connect` makes the robot stand up, arm and run, for egovcp-fake-g1. Else use its
     remote control: Y, A, start."""
@@ -62,11 +65,11 @@ class EgovcpG1(Robot):  # type: ignore[misc]
     def observation_features(self) -> dict[str, Any]:
         """Proprioception by name, and the depth image."""
         image = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
-        return {**dict.fromkeys(spec.STATE_NAMES, float), _DEPTH: image}
+        return {**dict.fromkeys(self._named(spec.STATE_NAMES), float), _DEPTH: image}
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(spec.ACTION_NAMES, float)
+        return dict.fromkeys(self._named(spec.ACTION_NAMES), float)
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -99,22 +102,26 @@ class EgovcpG1(Robot):  # type: ignore[misc]
     def get_observation(self) -> dict[str, Any]:
         """The next observation: `spec.STATE_NAMES`, and ``ego_depth`` (48, 64, 1) uint16 mm."""
         observation = self._running.observe()
-        state = dict(zip(spec.STATE_NAMES, observation.state.tolist(), strict=True))
+        names = self._named(spec.STATE_NAMES)
+        state = dict(zip(names, observation.state.tolist(), strict=True))
         return {**state, _DEPTH: observation.depth[..., None].copy()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Send `spec.ACTION_NAMES`, each in [-1, 1]; returns the rate-limited action."""
-        missing = [name for name in spec.ACTION_NAMES if name not in action]
+        names = self._named(spec.ACTION_NAMES)
+        missing = [name for name in names if name not in action]
         if missing:
-            raise UsageError(f"the action lacks {missing[0]}; expected {spec.ACTION_NAMES}")
-        wanted = np.array([float(action[name]) for name in spec.ACTION_NAMES])
-        taken = self._running.send(wanted)
-        return dict(zip(spec.ACTION_NAMES, taken.tolist(), strict=True))
+            raise UsageError(f"the action lacks {missing[0]}; expected {names}")
+        taken = self._running.send(np.array([float(action[name]) for name in names]))
+        return dict(zip(names, taken.tolist(), strict=True))
 
     def disconnect(self) -> None:
         """Hold, then damp. Suspend the robot first."""
         robot, self._robot = self._running, None
         robot.close()
+
+    def _named(self, names: tuple[str, ...]) -> list[str]:
+        return [name + self.config.suffix for name in names]
 
     @property
     def _running(self) -> ExternalPolicyRobot:
