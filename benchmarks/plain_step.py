@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
 from egovcp.model.networks import SplitLinear, SplitMlp
-from egovcp.model.value import REACH
 from egovcp_train.config import OptimizerConfig
 
 
@@ -200,16 +199,9 @@ def kl_terms(
     return [loss.kl_prior * kl(fixed_q, p), loss.kl_posterior * kl(q, fixed_p)]
 
 
-def value_error(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross entropy (...,) of logits (..., bins) and the two-hot encoded target (...,)."""
-    even = torch.linspace(-REACH, REACH, logits.shape[-1])
-    bins = even.sign() * torch.expm1(even.abs())
-    target = target.clamp(bins[0], bins[-1])
-    above = torch.bucketize(target, bins).clamp(min=1)
-    share = (target - bins[above - 1]) / (bins[above] - bins[above - 1])
-    high, low = F.one_hot(above, len(bins)), F.one_hot(above - 1, len(bins))
-    encoded = share[..., None] * high + (1 - share[..., None]) * low
-    return -(encoded * F.log_softmax(logits, -1)).sum(-1)
+def value_error(value: Tensor, target: Tensor) -> Tensor:
+    """Squared error (...,) of values (..., 1)."""
+    return (value.squeeze(-1) - target).square()
 
 
 def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[Tensor]:

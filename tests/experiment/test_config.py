@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_documented_commands_tune_neither_model_nor_planner(name: str) -> None:
     text = (ROOT / name).read_text()
     assert not re.findall(
-        r"--planner\.|--returns\.|--policy\.(?!path|push|repo|type|device|rev)", text
+        r"--planner\.|--returns\.|--policy\.(?!path|push|repo|type|device|rev|save_predicted)", text
     )
 
 

@@ -20,7 +20,7 @@ def test_images_start_at_the_filtered_state(flags: list[str], tmp_path: Path) ->
         assert np.shape(strip["seen"]) == (len(open_loop.HORIZONS), 48, 64)
         assert np.shape(strip["foreseen"]) == np.shape(strip["seen"])
     assert found["errors_m"]["0"]["repeat"] == 0.0
-    assert found["errors_m"]["16"]["model"] > 0.0
+    assert found["errors_m"]["8"]["model"] > 0.0
 
 
 def test_imagination_follows_the_actions_that_were_sent() -> None:
