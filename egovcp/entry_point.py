@@ -90,9 +90,9 @@ class EntryPoint:
         return code
 
     def _with_task(self, argv: Sequence[str]) -> list[str]:
-        """The arguments with the name of the task for ``--task=package.module:Class``.
+        """The arguments with names of tasks for ``--task=package.module:Class``, or a list of them.
 
-        The task is registered before the command is imported, so that it has the task's options.
+        Tasks are registered before the command is imported, so that it has their options.
         """
         args = list(argv)
         for i, arg in enumerate(args):
@@ -101,7 +101,9 @@ class EntryPoint:
             if ":" in value and (is_task or (i == 1 and self.prog == "egovcp-task")):
                 from egovcp.sim.tasks.registry import register_task
 
-                args[i] = arg.removesuffix(value) + register_task(value)
+                items = value.split(",")
+                names = [register_task(item) if ":" in item else item for item in items]
+                args[i] = arg.removesuffix(value) + ",".join(names)
         return args
 
     def _print_version(self) -> int:

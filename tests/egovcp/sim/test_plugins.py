@@ -11,6 +11,7 @@ import pytest
 import egovcp.sim.config as sim_config
 import egovcp.sim.tasks.registry as registry
 from egovcp.checks import ConformanceError, check_task
+from egovcp.entry_point import EntryPoint
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Oracle
@@ -245,6 +246,9 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
         find_task("post")
     assert register_task("post_task:PostTask") == "post" == register_task("post_task:PostTask")
     assert find_task("post").description == "leave a post alone"
+    command = EntryPoint("egovcp-collect", "egovcp_collect.collect")
+    arguments = command._with_task(["--task=ball,post_task:PostTask", "--seed=1"])
+    assert arguments == ["--task=ball,post", "--seed=1"]
     monkeypatch.setattr(registry, "_found", None)  # as in a child process
     assert find_task("post").name == "post"
     with pytest.raises(UsageError, match=r"'post_task:Nothing' .* has no attribute"):
