@@ -37,14 +37,16 @@ from egovcp.files import (
 )
 from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
 from egovcp.manifest import (
-    INPUT_FEATURES,
     MANIFEST,
-    OUTPUT_FEATURES,
     PROCESSORS,
     SCHEMA_VERSION,
     feature_spec,
+    input_features,
+    output_features,
+    processors,
     read_manifest,
     read_object,
+    robot_of,
     write_json_file,
     write_manifest,
 )
@@ -52,6 +54,7 @@ from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.model.weights import load_model, size_limit, tensor_shapes
 from egovcp.plan import PlannerConfig, Policy, require_compatible
 from egovcp.plan.config import require_affordable
+from egovcp.robot_spec import G1, RobotSpec
 
 if TYPE_CHECKING:
     from egovcp.data import ReturnConfig
@@ -74,6 +77,11 @@ class Artifact:
     world_model: WorldModel
     planner: PlannerConfig
     manifest: dict[str, Any]
+
+    @property
+    def robot(self) -> RobotSpec:
+        """The robot of the training data."""
+        return self.world_model.robot
 
     @property
     def controller_id(self) -> str:
@@ -115,13 +123,15 @@ def save_artifact(
         "type": "egovcp",
         "world_model": draccus.encode(model.config),
         "planner": draccus.encode(planner),
-        "input_features": INPUT_FEATURES,
-        "output_features": OUTPUT_FEATURES,
+        "input_features": input_features(model.robot),
+        "output_features": output_features(model.robot),
     }
     with removed_on_error(path.with_name(path.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
-        write_artifact(work, config, model.state_dict(), provenance, PROCESSORS)
+        write_artifact(
+            work, config, model.state_dict(), provenance, processors(model.robot), model.robot
+        )
         _replace(path, work)
 
 
@@ -131,6 +141,7 @@ def write_artifact(
     weights: Mapping[str, Tensor],
     provenance: Mapping[str, Any],
     processors: Mapping[str, Any],
+    robot: RobotSpec = G1,
 ) -> None:
     """Write the files of an artifact into a folder that exists; see `save_artifact`.
 
@@ -138,6 +149,7 @@ def write_artifact(
         config: LeRobot's configuration of the policy, with ``world_model`` and ``planner``.
         weights: the state of the world model.
         processors: JSON file name -> content; empty: they are not written.
+        robot: the robot of the world model.
 
     Raises:
         ArtifactError: the provenance names no controller, or a number in it is not finite.
@@ -151,7 +163,7 @@ def write_artifact(
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "egovcp_version": version("egovcp"),
-        "features": feature_spec(),
+        "features": feature_spec(robot),
         "files": {name: sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
         **provenance,
     }
@@ -205,7 +217,7 @@ def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POL
         _require_digest(folder / name, digest, digests.get(name))
     _check_processors(folder)
     config, planner = read_options(folder)
-    model = _load_weights(folder, config, digests.get(WEIGHTS))
+    model = _load_weights(folder, config, digests.get(WEIGHTS), robot_of(manifest))
     return Artifact(folder, model, planner, manifest)
 
 
@@ -234,17 +246,19 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
     return model, planner
 
 
-def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> WorldModel:
+def _load_weights(
+    folder: Path, config: WorldModelConfig, digest: object, robot: RobotSpec
+) -> WorldModel:
     path = folder / WEIGHTS
     try:
-        shapes = tensor_shapes(config)
+        shapes = tensor_shapes(config, robot)
     except ValueError as error:
         raise ArtifactError(f"{folder / CONFIG}: {error}") from error
     remedy = f"expected the weights of the networks in {CONFIG}: fetch or train the policy again"
     with _readable(path, remedy):
         content = read_bytes(path, size_limit(shapes))
         _require_digest(path, hashlib.sha256(content).hexdigest(), digest)
-        return load_model(config, shapes, content)
+        return load_model(config, shapes, content, robot)
 
 
 def shipped_policies() -> list[str]:

@@ -6,7 +6,6 @@ can renew the digests: every value is validated too.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import math
@@ -19,6 +18,7 @@ from egovcp import spec
 from egovcp.decode import DecodeError, require_type, shown
 from egovcp.errors import ArtifactError
 from egovcp.files import UnsafeFileError, read_json, write_json
+from egovcp.robot_spec import G1, RobotSpec
 
 SCHEMA_VERSION: Final = 2
 MANIFEST: Final = "manifest.json"
@@ -50,16 +50,14 @@ _DATASET_TYPES: Final[Mapping[str, Any]] = {
 }
 
 
-def feature_spec() -> dict[str, Any]:
+def feature_spec(robot: RobotSpec = G1) -> dict[str, Any]:
     """Names and shapes of observations and actions, and the action box."""
-    return {
-        "spec_version": spec.SPEC_VERSION,
-        "planner_hz": spec.PLANNER_HZ,
-        "depth": [spec.DEPTH_ROWS, spec.DEPTH_COLS],
-        "state_names": list(spec.STATE_NAMES),
-        "action_names": list(spec.ACTION_NAMES),
-        "action_box": {k: list(v) for k, v in dataclasses.asdict(spec.ACTION_BOX).items()},
-    }
+    return robot.to_json()
+
+
+def robot_of(manifest: Mapping[str, Any]) -> RobotSpec:
+    """The robot of a manifest that `read_manifest` has checked."""
+    return RobotSpec.from_json(manifest["features"])
 
 
 def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,6 +112,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def _check_features(path: Path, features: Any) -> None:
     expected = feature_spec()
     if json.dumps(features, sort_keys=True) == json.dumps(expected, sort_keys=True):
+        return
+    if isinstance(features, dict) and "robot_type" in features:
+        try:
+            RobotSpec.from_json(features)
+        except DecodeError as error:
+            raise ArtifactError(f"{path}: {error}; the file is damaged") from error
         return
     found = features if isinstance(features, dict) else {}
     differing = [k for k in expected if found.get(k) != expected[k]]
@@ -187,13 +191,21 @@ def _finite(path: Path) -> Iterator[None]:
 
 # --- LeRobot's processors ---------------------------------------------------------
 # LeRobot requires these files. Their steps change no number: the world model normalises its inputs.
-INPUT_FEATURES: Final[dict[str, Any]] = {
-    spec.DEPTH_KEY: {"type": "VISUAL", "shape": [1, spec.DEPTH_ROWS, spec.DEPTH_COLS]},
-    spec.STATE_KEY: {"type": "STATE", "shape": [spec.STATE_DIM]},
-}
-OUTPUT_FEATURES: Final[dict[str, Any]] = {
-    spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}
-}
+def input_features(robot: RobotSpec = G1) -> dict[str, Any]:
+    """LeRobot's description of the observations."""
+    return {
+        spec.DEPTH_KEY: {"type": "VISUAL", "shape": [1, *robot.depth]},
+        spec.STATE_KEY: {"type": "STATE", "shape": [robot.state_dim]},
+    }
+
+
+def output_features(robot: RobotSpec = G1) -> dict[str, Any]:
+    """LeRobot's description of the actions."""
+    return {spec.ACTION_KEY: {"type": "ACTION", "shape": [robot.action_dim]}}
+
+
+INPUT_FEATURES: Final = input_features()
+OUTPUT_FEATURES: Final = output_features()
 
 _IDENTITY = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 
@@ -212,18 +224,25 @@ def _pipeline(name: str, *steps: dict[str, Any]) -> dict[str, Any]:
 
 _TO_CPU = _step("device_processor", device="cpu", float_dtype=None)
 
-#: File name -> content.
-PROCESSORS: Final[dict[str, dict[str, Any]]] = {
-    "policy_preprocessor.json": _pipeline(
-        "policy_preprocessor",
-        _step("rename_observations_processor", rename_map={}),
-        _step("to_batch_processor"),
-        _TO_CPU,
-        _normalisation("normalizer_processor", {**INPUT_FEATURES, **OUTPUT_FEATURES}),
-    ),
-    "policy_postprocessor.json": _pipeline(
-        "policy_postprocessor",
-        _normalisation("unnormalizer_processor", OUTPUT_FEATURES),
-        _TO_CPU,
-    ),
-}
+
+def processors(robot: RobotSpec = G1) -> dict[str, dict[str, Any]]:
+    """File name -> content."""
+    inputs, outputs = input_features(robot), output_features(robot)
+    return {
+        "policy_preprocessor.json": _pipeline(
+            "policy_preprocessor",
+            _step("rename_observations_processor", rename_map={}),
+            _step("to_batch_processor"),
+            _TO_CPU,
+            _normalisation("normalizer_processor", {**inputs, **outputs}),
+        ),
+        "policy_postprocessor.json": _pipeline(
+            "policy_postprocessor",
+            _normalisation("unnormalizer_processor", outputs),
+            _TO_CPU,
+        ),
+    }
+
+
+#: Those of the G1.
+PROCESSORS: Final = processors()

@@ -98,7 +98,9 @@ def _raised(problems: Iterator[DataError]) -> Iterator[DataError]:
 
 
 def command_problems(episode: Episode) -> Iterator[tuple[int, str]]:
-    """The first tick whose command in o_t is not a_{t-1} (the neutral pose at t = 0)."""
+    """The first tick whose command in o_t is not a_{t-1} (the neutral pose at t = 0); of the G1."""
+    if not episode.robot.is_g1:
+        return
     before = np.vstack([np.zeros((1, spec.ACTION_DIM)), episode.action[:-1]])
     off = np.abs(command_from_state(episode.state) - spec.ACTION_BOX.to_metric(before)).max(axis=1)
     wrong = np.flatnonzero(off > COMMAND_TOLERANCE)
@@ -200,9 +202,10 @@ class StatisticsCheck:
                 yield DataError.at(path, f"has no statistics of {key}")
         if self._total is None or self._frames != self._reader.num_frames:
             return
+        places = stats.layout(self._reader.robot)
         for key in _checked(self._reader):
             if isinstance(found.get(key), dict):
-                for problem in _differences(found[key], self._total, key, self._frames):
+                for problem in _differences(found[key], self._total[:, places[key]], self._frames):
                     yield DataError.at(path, f"{key}: {problem}")
 
 
@@ -222,11 +225,12 @@ class EpisodeStatistics:
         if found_row is None or matrix is None:
             return
         path, row = found_row
+        places = stats.layout(self._reader.robot)
         for key in _checked(self._reader):
             prefix = f"stats/{key}/"
             found = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
             length = int(self._reader.lengths[index])
-            for problem in _differences(found, matrix, key, length):
+            for problem in _differences(found, matrix[:, places[key]], length):
                 yield DataError.at(path, f"statistics of {key}: {problem}", index)
 
     def _all_rows(self) -> Iterator[tuple[Any, Mapping[str, Any]]]:
@@ -255,10 +259,7 @@ def _statistics(reader: DatasetReader, episode: Episode) -> stats.Matrix:
     return np.concatenate([stats.data_stats(depth, columns), stats.index_stats(places)], axis=1)
 
 
-def _differences(
-    found: Mapping[str, object], matrix: stats.Matrix, key: str, frames: int
-) -> Iterator[str]:
-    part = matrix[:, stats.LAYOUT[key]]
+def _differences(found: Mapping[str, object], part: stats.Matrix, frames: int) -> Iterator[str]:
     least, most, mean = part[0], part[1], part[2]
     slack = _RELATIVE * (most - least + np.abs(mean)) + _ABSOLUTE
     for name, expected in zip(stats.ROWS, part, strict=True):

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from egovcp import spec
 from egovcp.data import files, metadata, schema, stats
@@ -243,7 +243,7 @@ def load_append_state(root: Path) -> AppendState:
         path = root / shard_paths(number)[1]
         with data_errors(path):
             shards.append(open_parquet(path).read())
-    matrices = [stats.from_arrow(shard) for shard in shards]
+    matrices = [stats.from_arrow(shard, reader.robot) for shard in shards]
     lengths = [shard["length"].to_pylist() for shard in shards]
     full = episodes // size
     kept = full * size
@@ -254,10 +254,11 @@ def load_append_state(root: Path) -> AppendState:
         {task: index for index, task in sorted(reader.task_names.items()) if task in present},
         [(stats.aggregate(matrices[n], lengths[n]), sum(lengths[n])) for n in range(full)],
         {name: hashes[name] for number in range(full) for name in shard_paths(number)},
+        reader.robot,
     )
     tail = []
     if kept < episodes:
-        tail = _read_tail(root, full, reader.records[kept:], matrices[full])
+        tail = _read_tail(reader, full, kept, matrices[full])
     return AppendState(contents, tail, reader.origin, _next_number(reader))
 
 
@@ -285,10 +286,12 @@ def _next_number(reader: DatasetReader) -> int:
 
 
 def _read_tail(
-    root: Path, number: int, records: Sequence[Mapping[str, Any]], matrices: list[stats.Matrix]
+    reader: DatasetReader, number: int, kept: int, matrices: list[stats.Matrix]
 ) -> list[EncodedEpisode]:
-    path = root / shard_paths(number)[0]
-    ordered = schema.episode_schema()
+    """The episodes from index ``kept`` on, which are those of shard ``number``."""
+    path = reader.root / shard_paths(number)[0]
+    records, robot = reader.records[kept:], reader.robot
+    ordered = schema.episode_schema(robot)
     with data_errors(path):
         file = open_parquet(path)
         tables = [
@@ -296,6 +299,6 @@ def _read_tail(
             for i in range(len(records))
         ]
     return [
-        EncodedEpisode(table, record, matrix[:, stats.DATA_COLUMNS])
+        EncodedEpisode(table, record, matrix[:, stats.data_columns(robot)], robot)
         for table, record, matrix in zip(tables, records, matrices, strict=True)
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.errors import DataError
+from egovcp.robot_spec import G1, RobotSpec
 
 _SUM_SLACK = 1e-5  # float32 rounding of the sum of the reward terms
 _ACTION_SLACK = 1e-6  # float32 rounding of an action on the boundary of its box
@@ -21,18 +23,25 @@ EPISODE_FRAMES: Final = 50_000
 
 type FrameLayout = tuple[tuple[int, ...], type[np.generic]]
 
-#: Array of an episode -> shape and dtype of a frame, in the order of the digest.
-FRAME_LAYOUT: Final[Mapping[str, FrameLayout]] = {
-    "depth": ((spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
-    "state": ((spec.STATE_DIM,), np.float32),
-    "action": ((spec.ACTION_DIM,), np.float32),
-    "reward": ((), np.float32),
-    "done": ((), np.bool_),
-    "success": ((), np.bool_),
-    "truncated": ((), np.bool_),
-    "reward_terms": ((len(spec.REWARD_TERMS),), np.float32),
-    "object": ((spec.OBJECT_DIM,), np.float32),
-}
+
+@cache
+def frame_layout(robot: RobotSpec) -> Mapping[str, FrameLayout]:
+    """Array of an episode -> shape and dtype of a frame, in the order of the digest."""
+    return {
+        "depth": (robot.depth, np.uint16),
+        "state": ((robot.state_dim,), np.float32),
+        "action": ((robot.action_dim,), np.float32),
+        "reward": ((), np.float32),
+        "done": ((), np.bool_),
+        "success": ((), np.bool_),
+        "truncated": ((), np.bool_),
+        "reward_terms": ((len(spec.REWARD_TERMS),), np.float32),
+        "object": ((spec.OBJECT_DIM,), np.float32),
+    }
+
+
+#: That of the G1.
+FRAME_LAYOUT: Final = frame_layout(G1)
 _OPTIONAL: Final = ("reward_terms", "object")
 _NOT_GIVEN: Final = np.empty((0, 0), np.float32)
 
@@ -69,11 +78,13 @@ class Episode:
     object: NDArray[np.float32] = field(default_factory=lambda: _NOT_GIVEN)
     """(T, 4) position of the task's object, m, heading frame, at the time of the observation, and
     whether it is known; zeros if not recorded."""
+    robot: RobotSpec = G1
+    """The robot; the shapes above are the G1's."""
 
     def __post_init__(self) -> None:
         for name in _OPTIONAL:
             if getattr(self, name) is _NOT_GIVEN:
-                shape, dtype = FRAME_LAYOUT[name]
+                shape, dtype = FRAME_LAYOUT[name]  # equal for all robots
                 object.__setattr__(self, name, np.zeros((len(self.reward), *shape), dtype))
 
     def __len__(self) -> int:
@@ -120,7 +131,7 @@ def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
         yield None, "no frames, expected at least one"
     if length > EPISODE_FRAMES:
         yield None, f"{length} frames, expected at most {EPISODE_FRAMES}"
-    for name, (frame, dtype) in FRAME_LAYOUT.items():
+    for name, (frame, dtype) in frame_layout(episode.robot).items():
         array, shape = getattr(episode, name), (length, *frame)
         if array.shape != shape or array.dtype != dtype:
             found, expected = f"{array.dtype} {array.shape}", f"{np.dtype(dtype)} {shape}"
@@ -137,7 +148,7 @@ def _value_problems(episode: Episode) -> Iterator[tuple[int, str]]:
         yield from _where_not(~differs, "reward differs from the sum of reward_terms")
     inside = ~(np.abs(episode.action).max(axis=1) > 1 + _ACTION_SLACK)  # NaN is reported above
     yield from _where_not(inside, "action lies outside [-1, 1]")
-    farthest = round(spec.DEPTH_MAX_M * 1000)
+    farthest = round(episode.robot.depth_max_m * 1000)
     deepest = episode.depth.reshape(len(episode), -1).max(axis=1)
     near = np.less_equal(deepest, farthest)
     yield from _where_not(near, f"depth exceeds the camera's range of {farthest} mm")

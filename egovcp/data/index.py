@@ -23,6 +23,7 @@ from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.data.reader import DatasetReader
 from egovcp.errors import DataError, UsageError, suggest
+from egovcp.robot_spec import RobotSpec
 
 SPLITS: Final = ("train", "heldout", "all")
 HELDOUT_FRACTION: Final = 0.05
@@ -129,6 +130,11 @@ class EpisodeIndex:
         return episodes_fingerprint(self.identities, self.length)
 
     @property
+    def robot(self) -> RobotSpec:
+        """The robot of all episodes."""
+        return self.readers[0].robot
+
+    @property
     def is_remote(self) -> bool:
         """Whether some data files are downloaded from the Hub when they are read."""
         return any(reader.is_remote for reader in self.readers)
@@ -179,11 +185,17 @@ def episodes_fingerprint(identities: Sequence[str], length: NDArray[np.int64]) -
 
 
 def require_mixable(readers: Sequence[DatasetReader]) -> None:
-    """Raise `DataError` unless all datasets share controller and rate."""
+    """Raise `DataError` unless all datasets share robot, controller and rate."""
     if not readers:
         raise DataError("no dataset given")
     first = readers[0]
     for other in readers[1:]:
+        if other.robot != first.robot:
+            raise DataError(
+                f"{other.root} is of robot {other.robot.robot_type}, {first.root} of robot "
+                f"{first.robot.robot_type}, or their names and sizes differ; train on the data of "
+                "one robot"
+            )
         for what in ("controller_id", "fps"):
             have, want = getattr(other, what), getattr(first, what)
             if have != want:

@@ -17,8 +17,10 @@ from egovcp.data import schema
 from egovcp.data.episode import EPISODE_FRAMES
 from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import check_template, files_below, require_file
+from egovcp.decode import DecodeError
 from egovcp.errors import DataError
 from egovcp.files import JSON_LIMIT_BYTES, read_json, sha256
+from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
 
 _EPISODE_COLUMNS = (
     "episode_index",
@@ -53,13 +55,24 @@ class EpisodeTable:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """``meta/info.json``, checked against format, rate and features of the specification."""
+    """``meta/info.json``, checked against format, rate and features of its robot."""
     info, path = load_v3_info(root), root / schema.INFO_PATH
-    if info["fps"] != spec.PLANNER_HZ:
-        raise DataError.at(path, f"{info['fps']} fps, expected {spec.PLANNER_HZ}")
+    robot = load_robot(info, path)
+    if info["fps"] != robot.planner_hz:
+        raise DataError.at(path, f"{info['fps']} fps, expected {robot.planner_hz}")
     with data_errors(path):
-        _check_features(dict(info["features"]), path)
+        _check_features(dict(info["features"]), path, robot)
     return info
+
+
+def load_robot(info: Mapping[str, Any], path: Path) -> RobotSpec:
+    """The robot that ``info.json``, at ``path``, describes; without an entry, the G1."""
+    if ROBOT_KEY not in info:
+        return G1
+    try:
+        return RobotSpec.from_json(info[ROBOT_KEY])
+    except DecodeError as error:
+        raise DataError.at(path, str(error)) from error
 
 
 def load_v3_info(root: Path) -> dict[str, Any]:
@@ -104,8 +117,8 @@ def load_json_object(
     return content
 
 
-def _check_features(features: Mapping[str, Any], path: Path) -> None:
-    for key, expected in schema.FEATURES.items():
+def _check_features(features: Mapping[str, Any], path: Path, robot: RobotSpec) -> None:
+    for key, expected in schema.features_of(robot).items():
         if key not in features and key in spec.OPTIONAL_KEYS:
             continue
         if key not in features:

@@ -22,6 +22,7 @@ from egovcp.data import schema, tiff
 from egovcp.data.paths import require_file
 from egovcp.errors import DataError
 from egovcp.files import require_regular
+from egovcp.robot_spec import G1, RobotSpec
 
 ROW_GROUP_ROWS: Final = 65_536
 """Largest number of rows of a row group, which is read as a whole: 0.4 GB of depth."""
@@ -142,23 +143,23 @@ def _column_problems(content: pq.FileMetaData, size: int, own: bool) -> Iterator
         yield f"has {size} bytes, but its row groups only {stored}"
 
 
-def open_data_file(root: Path, path: Path) -> pq.ParquetFile:
+def open_data_file(root: Path, path: Path, robot: RobotSpec = G1) -> pq.ParquetFile:
     """Open a data file of the dataset at ``root`` and check its column types."""
     require_file(root, path)
     file = open_parquet(path)
     with data_errors(path):
-        for problem in schema.type_problems(file.schema_arrow):
+        for problem in schema.type_problems(file.schema_arrow, robot):
             raise DataError.at(path, problem)
     return file
 
 
-def read_columns(table: pa.Table, names: Iterable[str]) -> Columns:
+def read_columns(table: pa.Table, names: Iterable[str], robot: RobotSpec = G1) -> Columns:
     """Columns of a table as arrays (see `to_numpy`); absent optional columns are zeros."""
     absent = {name for name in spec.OPTIONAL_KEYS if name not in table.column_names}
     return {
         name: np.zeros((table.num_rows, schema.width(name)), np.float32)
         if name in absent
-        else to_numpy(table[name], name)
+        else to_numpy(table[name], name, robot)
         for name in names
     }
 
@@ -168,8 +169,8 @@ def present_columns(names: Iterable[str], found: Container[str]) -> list[str]:
     return [name for name in names if name in found or name not in spec.OPTIONAL_KEYS]
 
 
-def to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:
-    """Convert a column to (T,), (T, n) or, for depth, (T, 48, 64); errors have `frame` set."""
+def to_numpy(column: pa.ChunkedArray, name: str, robot: RobotSpec = G1) -> NDArray[Any]:
+    """Convert a column to (T,), (T, n) or, for depth, (T, H, W); errors have `frame` set."""
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays(array.chunks)
@@ -177,8 +178,8 @@ def to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:
         empty = array.is_null().to_numpy(zero_copy_only=False)
         raise tiff.frame_error(int(np.argmax(empty)), f"column {name} is empty")
     if name == spec.DEPTH_KEY:
-        return tiff.decode(array.field("bytes"), spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name)
+        return tiff.decode(array.field("bytes"), *robot.depth)
+    dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name, robot)
     if width == 1:
         return np.asarray(array.to_numpy(zero_copy_only=False), dtype=dtype)
     sizes = pc.list_value_length(array).to_numpy()

@@ -23,21 +23,22 @@ _SIGN: Final = np.array([1, -1, 1, 1, -1, 1, *[1] * (DIM - 6)], np.float32)
 
 
 def privileged_features(
-    obj: NDArray[np.floating], reward_terms: NDArray[np.floating]
+    obj: NDArray[np.floating], reward_terms: NDArray[np.floating], hz: int = spec.PLANNER_HZ
 ) -> NDArray[np.float32]:
     """Features (T, `DIM`) of an episode, heading frame.
 
     Args:
         obj: (T, 4) position of the object, m, and whether it is known.
         reward_terms: (T, 6) of each row's action.
+        hz: rows per second.
     """
     rows, known = np.arange(len(obj)), obj[:, 3] > 0
     velocity = np.zeros((len(obj), 3))
-    velocity[1:] = (obj[1:, :3] - obj[:-1, :3]) * spec.PLANNER_HZ
+    velocity[1:] = (obj[1:, :3] - obj[:-1, :3]) * hz
     velocity[1:] *= (known[1:] & known[:-1])[:, None]
     last = np.maximum.accumulate(np.where(known, rows, -1))
     was_known = (last >= 0)[:, None]
-    age = np.where(last >= 0, np.minimum((rows - last) * spec.PLANNER_DT, _OLDEST_S), _OLDEST_S)
+    age = np.where(last >= 0, np.minimum((rows - last) * (1.0 / hz), _OLDEST_S), _OLDEST_S)
     events = np.zeros((len(obj), len(_EVENTS)))
     events[1:] = np.cumsum(reward_terms[:-1, _EVENTS], 0)
     columns = (obj[last, :3] * was_known, velocity[last] * was_known, known, age, events)

@@ -62,6 +62,8 @@ class DatasetReader:
         """Folder of the dataset."""
         self.info: Mapping[str, Any] = metadata.load_info(source.root)
         """``meta/info.json``."""
+        self.robot = metadata.load_robot(self.info, source.root / schema.INFO_PATH)
+        """The robot of the episodes."""
         self._table = metadata.load_episode_table(source.root, self.info)
         self.lengths = self._table.length
         """(E,) frames of each episode."""
@@ -233,6 +235,7 @@ class DatasetReader:
             task=self.task(index),
             time_limit=self.time_limit(index),
             metadata=self.metadata(index),
+            robot=self.robot,
         )
 
     def read_columns(self, names: Sequence[str]) -> Columns:
@@ -256,7 +259,7 @@ class DatasetReader:
                 table = self._rows(path, index, names)
                 if table.num_rows != self.lengths[index]:
                     raise DataError("ends before the end of the episode")
-                return read_columns(table, names)
+                return read_columns(table, names, self.robot)
         except DataError as error:
             raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
@@ -283,7 +286,7 @@ class DatasetReader:
         """A data file, and the rows (groups + 1,) at which its row groups begin and end."""
         if self._cache is not None:
             self._cache.get(path.relative_to(self.root).as_posix())
-        file = open_data_file(self.root, path)
+        file = open_data_file(self.root, path, self.robot)
         content = file.metadata
         groups = [content.row_group(g).num_rows for g in range(content.num_row_groups)]
         return file, np.cumsum([0, *groups])

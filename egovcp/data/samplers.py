@@ -22,6 +22,7 @@ from egovcp.data.order import EpisodeOrder, GroupedRows, Mix, group_episodes
 from egovcp.data.returns import ReturnConfig
 from egovcp.data.store import Batch, EpisodeStore, gather, mirror_windows
 from egovcp.errors import DataError, UsageError
+from egovcp.robot_spec import RobotSpec
 
 NO_WEIGHTS: Final = Mix()
 ALL_WINDOWS: Final = slice(None)
@@ -105,7 +106,8 @@ class InMemorySampler:
         start = np.clip(rows - offset, first, latest)
         part = self._part
         self._batches += 1
-        return _finish(gather(store, start[part], episode[part], config.span), config, rng, part)
+        batch = gather(store, start[part], episode[part], config.span)
+        return _finish(batch, config, rng, store.robot, part)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a sampler that loads it continues with exactly the next batch."""
@@ -174,7 +176,8 @@ class StreamingSampler:
         self._batches = 0
         slots = self._shuffle.episodes
         capacity = np.full(slots, int(index.length[self._order.episodes].max()))
-        self._slots = EpisodeStore.empty(capacity, np.zeros(slots, dtype=np.int64))
+        none = np.zeros(slots, dtype=np.int64)
+        self._slots = EpisodeStore.empty(capacity, none, robot=index.robot)
         self._held: NDArray[np.int64] = np.full(slots, -1)  # episode in each slot
         self._left = np.zeros(slots, dtype=np.int64)  # windows that each slot has still to yield
 
@@ -199,7 +202,7 @@ class StreamingSampler:
             wanted -= len(slots)
         batch = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         self._batches += 1
-        return _finish(batch, self.config, self._rng)
+        return _finish(batch, self.config, self._rng, self.index.robot)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a sampler that loads it continues with exactly the next batch."""
@@ -312,13 +315,18 @@ class PrefetchIterator:
 
 
 def _finish(
-    batch: Batch, config: SamplerConfig, rng: np.random.Generator, part: slice = ALL_WINDOWS
+    batch: Batch,
+    config: SamplerConfig,
+    rng: np.random.Generator,
+    robot: RobotSpec,
+    part: slice = ALL_WINDOWS,
 ) -> Batch:
-    """Mask the burn-in of ``part`` of a batch, unless an episode starts there, and reflect half."""
+    """Mask the burn-in of ``part`` of a batch, unless an episode starts there, and reflect half of
+    it if the robot is symmetric."""
     batch["valid"] &= ~((np.arange(config.span) < config.burn_in) & (batch["t"][:, :1] > 0))
-    if config.mirror:
+    if config.mirror and robot.mirror is not None:
         mirrored = rng.random(config.batch_size) < 0.5
-        mirror_windows(batch, np.flatnonzero(mirrored[part]))
+        mirror_windows(batch, np.flatnonzero(mirrored[part]), robot)
     return batch
 
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 import pyarrow as pa
 
 from egovcp import spec
+from egovcp.robot_spec import G1, RobotSpec
 
 CODEBASE_VERSION: Final = "v3.0"
-ROBOT_TYPE: Final = "unitree_g1"
 DEPTH_UNIT: Final = "mm"
 CHUNK_FILES: Final = 1000  # files per chunk folder
 FILE_MB: Final = 100  # for LeRobot's writer, should it append
@@ -36,6 +36,7 @@ INDEX_FEATURES: Final[dict[str, dict[str, object]]] = {
     key: {"dtype": "float32" if key == "timestamp" else "int64", "shape": (1,), "names": None}
     for key in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
+#: All columns, with the shapes and names of the G1.
 FEATURES: Final = {**spec.FEATURES, **INDEX_FEATURES}
 
 #: Numeric columns in the order of ``FEATURES``; every one but the depth image.
@@ -44,16 +45,21 @@ NUMERIC_KEYS: Final = tuple(key for key in FEATURES if key != spec.DEPTH_KEY)
 DATA_KEYS: Final = tuple(key for key in spec.FEATURES if key != spec.DEPTH_KEY)
 
 
-def width(key: str) -> int:
+def features_of(robot: RobotSpec) -> dict[str, dict[str, object]]:
+    """`FEATURES` with the shapes and names of ``robot``."""
+    return {**robot.features, **INDEX_FEATURES}
+
+
+def width(key: str, robot: RobotSpec = G1) -> int:
     """Values per frame of a numeric column."""
-    shape = FEATURES[key]["shape"]
+    shape = (INDEX_FEATURES.get(key) or robot.features[key])["shape"]
     assert isinstance(shape, tuple)
     return int(shape[0])
 
 
-def type_problems(found: pa.Schema) -> Iterator[str]:
+def type_problems(found: pa.Schema, robot: RobotSpec = G1) -> Iterator[str]:
     """Problems of the columns of a data file; lists may be of fixed size or not."""
-    expected = arrow_schema()
+    expected = arrow_schema(robot)
     for name in sorted(set(expected.names) - set(found.names) - set(spec.OPTIONAL_KEYS)):
         yield f"column {name} is missing"
     for field in found:
@@ -69,29 +75,31 @@ def _elements(kind: pa.DataType) -> tuple[bool, pa.DataType]:
     return listed, kind.value_type if listed else kind
 
 
-def info_features(controller_id: str) -> dict[str, dict[str, object]]:
+def info_features(controller_id: str, robot: RobotSpec = G1) -> dict[str, dict[str, object]]:
     """The ``features`` of ``info.json``.
 
     The action's ``info`` names the controller, on which the effect of an action depends: LeRobot's
     tools keep feature descriptions and refuse to merge datasets in which they differ.
     """
-    features = {key: dict(value) for key, value in FEATURES.items()}
+    features = {key: dict(value) for key, value in features_of(robot).items()}
     features[spec.DEPTH_KEY]["info"] = {"is_depth_map": True, "depth_unit": DEPTH_UNIT}
     features[spec.ACTION_KEY]["info"] = {"controller_id": controller_id}
     return features
 
 
-def arrow_schema() -> pa.Schema:
+def arrow_schema(robot: RobotSpec = G1) -> pa.Schema:
     """Arrow schema of the data files, with the metadata that `datasets` reads its types from."""
-    fields = [pa.field(key, _arrow_type(feature)) for key, feature in FEATURES.items()]
-    hub = {key: _hub_type(feature) for key, feature in FEATURES.items()}
+    features = features_of(robot)
+    fields = [pa.field(key, _arrow_type(feature)) for key, feature in features.items()]
+    hub = {key: _hub_type(feature) for key, feature in features.items()}
     metadata = {"huggingface": json.dumps({"info": {"features": hub}})}
     return pa.schema(fields, metadata=metadata)
 
 
-def episode_schema() -> pa.Schema:
+def episode_schema(robot: RobotSpec = G1) -> pa.Schema:
     """Arrow schema of an episode: depth and `DATA_KEYS`."""
-    return pa.schema([pa.field(key, _arrow_type(spec.FEATURES[key])) for key in spec.FEATURES])
+    fields = robot.features.items()
+    return pa.schema([pa.field(key, _arrow_type(feature)) for key, feature in fields])
 
 
 def _arrow_type(feature: Mapping[str, Any]) -> pa.DataType:

@@ -25,9 +25,11 @@ from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.files import sha256
+from egovcp.robot_spec import G1, RobotSpec
 
 _RECORD: Final = b"egovcp.facts"
 _STATS: Final = b"egovcp.stats"
+_ROBOT: Final = b"egovcp.robot"  # absent for the G1
 _NAME: Final = re.compile(r"(\d{9})-([0-9a-f]{64})\.arrow")
 
 
@@ -41,6 +43,7 @@ class EncodedEpisode:
     """The record in ``meta/collection.json``: task, length, time_limit, sha256, metadata."""
     stats: stats.Matrix
     """(R, D1) of `stats.data_stats`."""
+    robot: RobotSpec = G1
 
     def __len__(self) -> int:
         return int(self.table.num_rows)
@@ -57,7 +60,7 @@ def encode(episode: Episode, where: str = "episode") -> EncodedEpisode:
         [tiff.encode(episode.depth), pa.array(names)], ["bytes", "path"]
     )
     arrays = {spec.DEPTH_KEY: image, **{key: _arrow(columns[key]) for key in schema.DATA_KEYS}}
-    ordered = schema.episode_schema()
+    ordered = schema.episode_schema(episode.robot)
     record = {
         "task": episode.task,
         "length": len(episode),
@@ -69,6 +72,7 @@ def encode(episode: Episode, where: str = "episode") -> EncodedEpisode:
         pa.Table.from_arrays([arrays[field.name] for field in ordered], schema=ordered),
         record,
         stats.data_stats(episode.depth, columns),
+        episode.robot,
     )
 
 
@@ -83,13 +87,13 @@ def with_index(
     """The rows of a data file, and their statistics (R, D), at a position in the dataset."""
     frames = np.arange(len(encoded), dtype=np.int64)
     columns: dict[str, NDArray[np.generic]] = {
-        "timestamp": (frames / spec.PLANNER_HZ).astype(np.float32),
+        "timestamp": (frames / encoded.robot.planner_hz).astype(np.float32),
         "frame_index": frames,
         "episode_index": np.full_like(frames, episode_index),
         "index": frames + first_frame,
         "task_index": np.full_like(frames, task_index),
     }
-    ordered = schema.arrow_schema()
+    ordered = schema.arrow_schema(encoded.robot)
     own = dict(zip(encoded.table.column_names, encoded.table.columns, strict=True))
     arrays = own | {key: pa.array(values) for key, values in columns.items()}
     table = pa.Table.from_arrays([arrays[field.name] for field in ordered], schema=ordered)
@@ -102,6 +106,8 @@ def to_bytes(encoded: EncodedEpisode) -> pa.Buffer:
         _RECORD: json.dumps(dict(encoded.record), allow_nan=False).encode(),
         _STATS: np.ascontiguousarray(encoded.stats, dtype="<f8").tobytes(),
     }
+    if not encoded.robot.is_g1:
+        metadata[_ROBOT] = json.dumps(encoded.robot.to_json()).encode()
     sink = pa.BufferOutputStream()
     table = encoded.table.replace_schema_metadata(metadata)
     with pa.ipc.new_file(sink, table.schema) as writer:
@@ -116,9 +122,10 @@ def from_buffer(buffer: pa.Buffer) -> EncodedEpisode:
         metadata = table.schema.metadata or {}
         record = json.loads(metadata[_RECORD])
         matrix = np.frombuffer(metadata[_STATS], dtype="<f8").reshape(len(stats.ROWS), -1)
+        robot = RobotSpec.from_json(json.loads(metadata[_ROBOT])) if _ROBOT in metadata else G1
     except (pa.ArrowException, KeyError, ValueError) as error:
         raise DataError(f"not a staged episode: {error}") from error
-    return EncodedEpisode(table.replace_schema_metadata(None), record, matrix)
+    return EncodedEpisode(table.replace_schema_metadata(None), record, matrix, robot)
 
 
 @dataclass(frozen=True)

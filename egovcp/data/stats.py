@@ -8,6 +8,7 @@ min, max, mean and std, and the count-weighted mean of the episodes' quantiles.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import schema
+from egovcp.robot_spec import G1, RobotSpec
 
 QUANTILES: Final = (0.01, 0.10, 0.50, 0.90, 0.99)
 ROWS: Final = ("min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES))
@@ -24,18 +26,19 @@ _MIN, _MAX, _MEAN, _STD, _QUANTILES = 0, 1, 2, 3, slice(4, None)
 type Matrix = NDArray[np.float64]
 
 
-def _layout() -> dict[str, slice]:
+@cache
+def layout(robot: RobotSpec = G1) -> Mapping[str, slice]:
+    """Feature -> its columns of a matrix, in the order of `schema.FEATURES`."""
     slices, start = {spec.DEPTH_KEY: slice(0, 1)}, 1
     for key in schema.NUMERIC_KEYS:
-        slices[key] = slice(start, start + schema.width(key))
+        slices[key] = slice(start, start + schema.width(key, robot))
         start = slices[key].stop
     return slices
 
 
-LAYOUT: Final = _layout()
-_DIM: Final = 1 + sum(map(schema.width, schema.NUMERIC_KEYS))
-#: Columns of a matrix that `data_stats` fills; `index_stats` fills the rest.
-DATA_COLUMNS: Final = slice(0, LAYOUT[next(iter(schema.INDEX_FEATURES))].start)
+def data_columns(robot: RobotSpec = G1) -> slice:
+    """Columns of a matrix that `data_stats` fills; `index_stats` fills the rest."""
+    return slice(0, layout(robot)[next(iter(schema.INDEX_FEATURES))].start)
 
 
 def data_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
@@ -81,21 +84,23 @@ def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
     return out
 
 
-def to_json(matrix: Matrix, count: int) -> dict[str, dict[str, object]]:
+def to_json(matrix: Matrix, count: int, robot: RobotSpec = G1) -> dict[str, dict[str, object]]:
     return {
         key: {
             **{row: _nested(key, matrix[None, i, part])[0] for i, row in enumerate(ROWS)},
             "count": [count],
         }
-        for key, part in LAYOUT.items()
+        for key, part in layout(robot).items()
     }
 
 
-def to_arrow(matrices: Sequence[Matrix], counts: Sequence[int]) -> dict[str, pa.Array]:
+def to_arrow(
+    matrices: Sequence[Matrix], counts: Sequence[int], robot: RobotSpec = G1
+) -> dict[str, pa.Array]:
     """``stats/<feature>/<statistic>`` columns of the episodes table, one row per episode."""
     stacked = np.stack(matrices)
     columns: dict[str, pa.Array] = {}
-    for key, part in LAYOUT.items():
+    for key, part in layout(robot).items():
         for i, row in enumerate(ROWS):
             columns[f"stats/{key}/{row}"] = pa.array(_nested(key, stacked[:, i, part]))
         columns[f"stats/{key}/count"] = pa.array([[count] for count in counts])
@@ -108,10 +113,12 @@ def _nested(key: str, values: Matrix) -> list[Any]:
     return nested
 
 
-def from_arrow(table: pa.Table) -> list[Matrix]:
+def from_arrow(table: pa.Table, robot: RobotSpec = G1) -> list[Matrix]:
     """The matrices ``(R, D)`` of the episodes in a table of `to_arrow`."""
-    out: list[Matrix] = [np.empty((len(ROWS), _DIM)) for _ in range(table.num_rows)]
-    for key, part in LAYOUT.items():
+    places = layout(robot)
+    size = max(part.stop for part in places.values())
+    out: list[Matrix] = [np.empty((len(ROWS), size)) for _ in range(table.num_rows)]
+    for key, part in places.items():
         for i, row in enumerate(ROWS):
             for matrix, values in zip(out, table[f"stats/{key}/{row}"].to_pylist(), strict=True):
                 matrix[i, part] = np.ravel(values)

@@ -10,29 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import privileged
-from egovcp.data.episode import FRAME_LAYOUT, Episode, FrameLayout
+from egovcp.data.episode import Episode, FrameLayout, frame_layout
 from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, episodes_fingerprint
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.data.mirror import mirror_depth
 from egovcp.data.reader import DatasetReader
 from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.robot_spec import G1, RobotSpec
 
 type Batch = dict[str, NDArray[Any]]
 
 _FROM_EPISODE: Final = ("depth", "state", "action", "done", "success")
-_ARRAYS: Final[Mapping[str, FrameLayout]] = {
-    **{name: FRAME_LAYOUT[name] for name in _FROM_EPISODE},
-    "privileged": ((privileged.DIM,), np.float32),
-    "reward": FRAME_LAYOUT["reward"],
-    "prev_action": FRAME_LAYOUT["action"],
-    "terminal_next": ((), np.bool_),
-    "mc_return": ((), np.float32),
-    "mc_valid": ((), np.bool_),
-}
+
+
+def _arrays(robot: RobotSpec) -> Mapping[str, FrameLayout]:
+    layout = frame_layout(robot)
+    return {
+        **{name: layout[name] for name in _FROM_EPISODE},
+        "privileged": ((privileged.DIM,), np.float32),
+        "reward": layout["reward"],
+        "prev_action": layout["action"],
+        "terminal_next": ((), np.bool_),
+        "mc_return": ((), np.float32),
+        "mc_valid": ((), np.bool_),
+    }
 
 
 @dataclass(frozen=True)
 class EpisodeStore:
-    """N frames of E episodes, one after the other; arrays without another shape are (N,)."""
+    """N frames of E episodes, one after the other; arrays without another shape are (N,).
+
+    The shapes of images, states and actions are those of the G1.
+    """
 
     depth: NDArray[np.uint16]
     """(N, 48, 64) mm; (0, 48, 64) if the images were left out."""
@@ -62,6 +70,8 @@ class EpisodeStore:
     """(E,) task of each episode; for sampling and reports, never for the network."""
     identities: tuple[str, ...]
     """(E,) `DatasetReader.identity` of each episode."""
+    robot: RobotSpec = G1
+    """The robot of all episodes."""
 
     @classmethod
     def load(
@@ -84,7 +94,9 @@ class EpisodeStore:
         cls, index: EpisodeIndex, returns: ReturnConfig | None = None, images: bool = True
     ) -> Self:
         """Read and validate all episodes of an index, and store their images or not."""
-        store = cls.empty(index.length, index.dataset, index.tasks, index.identities, images)
+        store = cls.empty(
+            index.length, index.dataset, index.tasks, index.identities, images, index.robot
+        )
         for number in range(len(index)):
             store.fill(number, index.read(number), returns or ReturnConfig())
         return store
@@ -97,12 +109,13 @@ class EpisodeStore:
         tasks: tuple[str, ...] = (),
         identities: tuple[str, ...] = (),
         images: bool = True,
+        robot: RobotSpec = G1,
     ) -> Self:
         """Allocate arrays for episodes of these lengths."""
         frames = int(length.sum())
         arrays: dict[str, NDArray[Any]] = {
             name: np.empty((frames if images or name != "depth" else 0, *shape), dtype=dtype)
-            for name, (shape, dtype) in _ARRAYS.items()
+            for name, (shape, dtype) in _arrays(robot).items()
         }
         start = length.cumsum() - length
         return cls(
@@ -112,6 +125,7 @@ class EpisodeStore:
             dataset=dataset,
             tasks=tasks,
             identities=identities,
+            robot=robot,
         )
 
     def fill(self, number: int, episode: Episode, config: ReturnConfig) -> None:
@@ -121,7 +135,9 @@ class EpisodeStore:
         for name in _FROM_EPISODE:
             if name != "depth" or len(self.depth):
                 getattr(self, name)[rows] = getattr(episode, name)
-        self.privileged[rows] = privileged.privileged_features(episode.object, episode.reward_terms)
+        self.privileged[rows] = privileged.privileged_features(
+            episode.object, episode.reward_terms, self.robot.planner_hz
+        )
         self.prev_action[first] = 0.0
         self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
         self.terminal_next[rows] = is_terminal(episode.done, episode.truncated)
@@ -172,10 +188,10 @@ def gather(
     return batch
 
 
-def mirror_windows(batch: Batch, windows: NDArray[np.intp]) -> None:
-    """Reflect some windows of a batch left to right, in place."""
+def mirror_windows(batch: Batch, windows: NDArray[np.intp], robot: RobotSpec = G1) -> None:
+    """Reflect some windows of a batch of a symmetric robot left to right, in place."""
     batch["depth"][windows] = mirror_depth(batch["depth"][windows])
-    batch["state"][windows] = mirror_state(batch["state"][windows])
+    batch["state"][windows] = robot.mirrored_state(batch["state"][windows])
     batch["privileged"][windows] = privileged.mirror_privileged(batch["privileged"][windows])
     for name in ("action", "prev_action"):
-        batch[name][windows] = mirror_action(batch[name][windows])
+        batch[name][windows] = robot.mirrored_action(batch[name][windows])

@@ -32,7 +32,7 @@ def compute_training_stats(
 ) -> TrainingStats:
     """Read and validate every episode once."""
     config = returns or ReturnConfig()
-    total, squares = np.zeros(spec.STATE_DIM), np.zeros(spec.STATE_DIM)
+    total, squares = np.zeros(index.robot.state_dim), np.zeros(index.robot.state_dim)
     found: list[NDArray[np.float32]] = []
     for number in tqdm(range(len(index)), unit="ep", desc="check", leave=False):
         episode = index.read(number)

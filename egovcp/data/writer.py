@@ -28,8 +28,9 @@ from egovcp.data.destination import is_vacant, make_parent, require_new, resolve
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
 from egovcp.data.staging import EncodedEpisode, encode, with_index
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.files import removed_on_error, sha256
+from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
 
 #: A file system or kernel that cannot exchange two folders.
 _NO_EXCHANGE: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
@@ -55,14 +56,15 @@ class ShardWriter:
     Both files are complete and flushed after `close`.
     """
 
-    def __init__(self, folder: Path, number: int) -> None:
+    def __init__(self, folder: Path, number: int, robot: RobotSpec) -> None:
         self._folder = folder
+        self._robot = robot
         self._place = _place(number)
         self._data_path, self._episodes_path = shard_paths(number)
         self._file: IO[bytes] = files.create(folder / self._data_path)
         # A dictionary does not compress depth; snappy halves it at little cost.
         self._writer = pq.ParquetWriter(
-            self._file, schema.arrow_schema(), compression="snappy", use_dictionary=False
+            self._file, schema.arrow_schema(robot), compression="snappy", use_dictionary=False
         )
         self._rows: list[dict[str, Any]] = []
         self._stats: list[stats.Matrix] = []
@@ -94,7 +96,7 @@ class ShardWriter:
         self._file.close()
         counts = [row["length"] for row in self._rows]
         table = pa.Table.from_pylist(self._rows)
-        columns = stats.to_arrow(self._stats, counts)
+        columns = stats.to_arrow(self._stats, counts, self._robot)
         for name, value in self._place.items():
             columns[f"meta/episodes/{name}"] = pa.array([value] * len(counts))
         for name, column in columns.items():
@@ -126,6 +128,8 @@ class VersionContents:
     """Statistics and number of frames of each shard."""
     hashes: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each file of a shard."""
+    robot: RobotSpec | None = None
+    """The robot of all episodes; None: that of the first that is added."""
 
     @property
     def frames(self) -> int:
@@ -154,6 +158,7 @@ class VersionWriter:
         self._totals = list(self._complete.totals)
         self._hashes = dict(self._complete.hashes)
         self._shard: ShardWriter | None = None
+        self._robot = self._complete.robot
         folder.mkdir(parents=True)
         if previous is not None:
             with removed_on_error(folder):
@@ -174,11 +179,22 @@ class VersionWriter:
         return len(self._records)
 
     def add(self, encoded: EncodedEpisode) -> None:
-        """Append an episode."""
+        """Append an episode.
+
+        Raises:
+            DataError: it is of another robot than the first.
+        """
+        self._robot = self._robot or encoded.robot
+        if encoded.robot != self._robot:
+            raise DataError(
+                f"an episode of robot {encoded.robot.robot_type} cannot be added to a dataset of "
+                f"robot {self._robot.robot_type}, or its names and sizes differ; write it to a "
+                "dataset of its own"
+            )
         record = json.dumps(dict(encoded.record), allow_nan=False)
         task = self._tasks.setdefault(encoded.record["task"], len(self._tasks))
         if self._shard is None:
-            self._shard = ShardWriter(self.folder, len(self._totals))
+            self._shard = ShardWriter(self.folder, len(self._totals), self._robot)
         self._shard.add(encoded, self.episodes, self.frames, task)
         self._records.append(record)
         self.frames += len(encoded)
@@ -197,6 +213,7 @@ class VersionWriter:
             tasks=dict(self._tasks),
             totals=tuple(self._totals),
             hashes=dict(self._hashes),
+            robot=self._robot,
         )
 
     def close(self) -> VersionContents:
@@ -204,7 +221,7 @@ class VersionWriter:
         if self._shard is not None:
             self._close_shard(self._shard)
         matrices, counts = zip(*self._totals, strict=True)
-        total = stats.to_json(stats.aggregate(matrices, counts), self.frames)
+        total = stats.to_json(stats.aggregate(matrices, counts), self.frames, self._robot or G1)
         self._write_tasks()
         files.write_json(self.folder / schema.INFO_PATH, self._info())
         files.write_json(self.folder / schema.STATS_PATH, total)
@@ -230,10 +247,11 @@ class VersionWriter:
             frame.to_parquet(file)
 
     def _info(self) -> dict[str, Any]:
+        robot = self._robot or G1
         return {
             "codebase_version": schema.CODEBASE_VERSION,
-            "fps": spec.PLANNER_HZ,
-            "features": schema.info_features(self.provenance.controller_id),
+            "fps": robot.planner_hz,
+            "features": schema.info_features(self.provenance.controller_id, robot),
             "total_episodes": self.episodes,
             "total_frames": self.frames,
             "total_tasks": len(self._tasks),
@@ -242,8 +260,9 @@ class VersionWriter:
             "video_files_size_in_mb": 200,
             "data_path": schema.DATA_PATH,
             "video_path": None,
-            "robot_type": schema.ROBOT_TYPE,
+            "robot_type": robot.robot_type,
             "splits": {"train": f"0:{self.episodes}"},
+            **({} if robot.is_g1 else {ROBOT_KEY: robot.to_json()}),
         }
 
     def _collection(self) -> bytes:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from egovcp import spec
+from egovcp.robot_spec import G1, PATCH
 
 
 class SplitLinear(nn.Module):
@@ -92,13 +92,13 @@ class GruCell(nn.Module):
 
 
 class DepthEncoder(nn.Module):
-    """Image of nearness and validity (B, 2, 48, 64) -> features (B, C * 3 * 4).
+    """Image of nearness and validity (B, 2, H, W) -> features (B, C * H / 16 * W / 16).
 
     The stem has overlapping 8 x 8 patches at stride 4: on a CPU a third of the cost of two
     stride-2 layers.
     """
 
-    def __init__(self, channels: tuple[int, int, int]) -> None:
+    def __init__(self, channels: tuple[int, int, int], shape: tuple[int, int] = G1.depth) -> None:
         super().__init__()
         stem, middle, last = channels
         self.layers = nn.Sequential(
@@ -110,7 +110,7 @@ class DepthEncoder(nn.Module):
             nn.SiLU(),
             nn.Flatten(),
         )
-        self.outputs = last * (spec.DEPTH_ROWS // 16) * (spec.DEPTH_COLS // 16)
+        self.outputs = last * (shape[0] // PATCH) * (shape[1] // PATCH)
 
     def forward(self, image: Tensor) -> Tensor:
         features: Tensor = self.layers(image.contiguous(memory_format=torch.channels_last))
@@ -118,16 +118,17 @@ class DepthEncoder(nn.Module):
 
 
 class DepthDecoder(nn.Module):
-    """State features (B, inputs) -> nearness image (B, 48, 64).
+    """State features (B, inputs) -> nearness image (B, H, W).
 
-    A map of 6 x 8 cells; each is decoded to 8 x 8 pixels.
+    A map of H / 8 x W / 8 cells; each is decoded to 8 x 8 pixels.
     """
 
     PATCH = 8
 
-    def __init__(self, inputs: int, channels: int) -> None:
+    def __init__(self, inputs: int, channels: int, shape: tuple[int, int] = G1.depth) -> None:
         super().__init__()
-        self.shape = (channels, spec.DEPTH_ROWS // self.PATCH, spec.DEPTH_COLS // self.PATCH)
+        self.image = shape
+        self.shape = (channels, shape[0] // self.PATCH, shape[1] // self.PATCH)
         self.project = nn.Linear(inputs, math.prod(self.shape))
         self.layers = nn.Sequential(
             nn.SiLU(),
@@ -142,4 +143,4 @@ class DepthDecoder(nn.Module):
         # The same as `F.pixel_shuffle`, three times as fast on a CPU.
         rows, cols = self.shape[1:]
         cells = patches.permute(0, 2, 3, 1).reshape(-1, rows, cols, self.PATCH, self.PATCH)
-        return cells.transpose(2, 3).reshape(-1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+        return cells.transpose(2, 3).reshape(-1, *self.image)

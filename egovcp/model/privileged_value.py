@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model.networks import SplitMlp
 from egovcp.model.parallel import row_noise
+from egovcp.robot_spec import G1, RobotSpec
 
 _UNITS: Final = 256
 _LAYERS: Final = 3
@@ -29,23 +30,24 @@ class PrivilegedValue(nn.Module):
 
     Args:
         features: number of privileged features.
+        robot: whose state and actions are inputs.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, features: int) -> None:
+    def __init__(self, features: int, robot: RobotSpec = G1) -> None:
         super().__init__()
-        inputs = (spec.STATE_DIM, features, spec.ACTION_DIM)
+        inputs = (robot.state_dim, features, robot.action_dim)
         self.network = SplitMlp(inputs, _UNITS, 1, hidden_layers=_LAYERS)
         self.network.start_at_zero()
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("std", torch.ones(features))
 
     @classmethod
-    def restore(cls, state: Mapping[str, Tensor]) -> Self:
+    def restore(cls, state: Mapping[str, Tensor], robot: RobotSpec = G1) -> Self:
         """The value that a ``state_dict`` describes, without gradients."""
-        value = cls(len(state["mean"]))
+        value = cls(len(state["mean"]), robot)
         value.load_state_dict(state)
         return value.requires_grad_(False)
 

@@ -15,10 +15,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from egovcp import spec
 from egovcp.files import UnsafeFileError
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.world_model import WorldModel
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.tensor_file import HEADER_LIMIT_BYTES, TensorFile
 
 MAX_WEIGHT_BYTES: Final = 512 << 20
@@ -30,14 +30,14 @@ _POSITIVE: Final = ("state_std", "return_std")
 _BYTES: Final = 4  # of a float32
 
 
-def tensor_shapes(config: WorldModelConfig) -> dict[str, tuple[int, ...]]:
+def tensor_shapes(config: WorldModelConfig, robot: RobotSpec = G1) -> dict[str, tuple[int, ...]]:
     """Name and shape of every tensor of a model's state; nothing is allocated.
 
     Raises:
         ValueError: the model has more than `MAX_WEIGHT_BYTES`.
     """
     with torch.device("meta"):
-        state = WorldModel(config).state_dict()
+        state = WorldModel(config, robot).state_dict()
     size = sum(tensor.numel() for tensor in state.values()) * _BYTES
     if size > MAX_WEIGHT_BYTES:
         raise ValueError(
@@ -53,7 +53,10 @@ def size_limit(shapes: Mapping[str, tuple[int, ...]]) -> int:
 
 
 def load_model(
-    config: WorldModelConfig, shapes: Mapping[str, tuple[int, ...]], content: bytes
+    config: WorldModelConfig,
+    shapes: Mapping[str, tuple[int, ...]],
+    content: bytes,
+    robot: RobotSpec = G1,
 ) -> WorldModel:
     """Build a model in evaluation mode with the weights of a file.
 
@@ -61,6 +64,7 @@ def load_model(
         config: configuration of the model.
         shapes: its `tensor_shapes`.
         content: bytes of the file.
+        robot: the robot of the model.
 
     Raises:
         UnsafeFileError: the tensors do not match the configuration, a value is not finite, or an
@@ -73,7 +77,7 @@ def load_model(
     except SafetensorError as error:
         raise UnsafeFileError(f"not a safetensors file: {error}") from error
     _check_numbers(weights)
-    model = WorldModel(config)
+    model = WorldModel(config, robot)
     model.load_state_dict(weights)
     model.eval()
     _check_outputs(model)
@@ -95,8 +99,8 @@ def _check_numbers(weights: Mapping[str, Tensor]) -> None:
 @torch.inference_mode()
 def _check_outputs(model: WorldModel) -> None:
     """Finite weights may still overflow: filter an empty image and evaluate the neutral action."""
-    action = torch.zeros(1, spec.ACTION_DIM)
-    depth = torch.zeros(1, spec.DEPTH_ROWS, spec.DEPTH_COLS, dtype=torch.int32)
+    action = torch.zeros(1, model.robot.action_dim)
+    depth = torch.zeros(1, *model.robot.depth, dtype=torch.int32)
     first = torch.ones(1, dtype=torch.bool)
     carry = model.observe(model.initial(1), action, depth, model.state_mean[None], first)
     carry = model.imagine(carry, action)

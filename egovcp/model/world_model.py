@@ -37,10 +37,12 @@ from egovcp.model.networks import (
     SplitLinear,
     SplitMlp,
 )
+from egovcp.robot_spec import G1, RobotSpec
 
 MIN_STATE_STD: Final = 0.02  # constants, such as the velocity command of a standing robot
 MIN_RETURN_QUANTILE: Final = 0.001
-#: Typical position and velocity of a task's object and their deviations, heading frame, m and m/s.
+#: Typical position and velocity of a task's object and their deviations, heading frame, m and m/s,
+#: for the range of the G1's camera; for another range they are scaled with it.
 OBJECT_MEAN: Final = (1.5, 0.0, 0.35, -0.5, 0.0, -0.1)
 OBJECT_STD: Final = (0.9, 0.25, 0.2, 1.5, 0.5, 1.0)
 
@@ -59,7 +61,12 @@ class PosteriorHead(nn.Module):
 
 
 class WorldModel(nn.Module):
-    """Networks, normalisation and the recurrence; the losses are in `egovcp.model.losses`."""
+    """Networks, normalisation and the recurrence; the losses are in `egovcp.model.losses`.
+
+    Args:
+        config: sizes of the networks.
+        robot: whose observations and actions it models; the shapes in this class are the G1's.
+    """
 
     state_mean: Tensor
     state_std: Tensor
@@ -70,20 +77,21 @@ class WorldModel(nn.Module):
     object_mean: Tensor
     object_std: Tensor
 
-    def __init__(self, config: WorldModelConfig) -> None:
+    def __init__(self, config: WorldModelConfig, robot: RobotSpec = G1) -> None:
         super().__init__()
         self.config = c = config
+        self.robot = robot
         state = (c.hidden, c.latent)  # input of every head
-        self.encode_depth = DepthEncoder(c.channels)
-        self.encode_state = SplitMlp((spec.STATE_DIM,), c.units, c.units)
+        self.encode_depth = DepthEncoder(c.channels, robot.depth)
+        self.encode_state = SplitMlp((robot.state_dim,), c.units, c.units)
         self.embed_observation = SplitLinear((self.encode_depth.outputs, c.units), c.units)
-        self.mix = SplitLinear((c.latent, spec.ACTION_DIM), c.units)
+        self.mix = SplitLinear((c.latent, robot.action_dim), c.units)
         self.mix_act = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU())
         self.gru = GruCell(c.units, c.hidden, c.update_bias)
         self.posterior = PosteriorHead(c.hidden, c.units, c.latent)
         self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
-        self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
-        self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
+        self.decode_depth = DepthDecoder(sum(state), c.channels[-1], robot.depth)
+        self.decode_state = SplitMlp(state, c.units, robot.state_dim)
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = self._value_head(value.width(c.value_loss))
         self.reward_head = self._value_head(1) if c.loss.reward > 0 else None
@@ -93,18 +101,20 @@ class WorldModel(nn.Module):
                 SplitMlp(state, c.units, len(OBJECT_MEAN)) if predicts_object else None
             )
         self._start_at_zero()
-        self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
-        self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
+        self.register_buffer("state_mean", torch.zeros(robot.state_dim))
+        self.register_buffer("state_std", torch.ones(robot.state_dim))
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("min_return", torch.zeros(()))
         self.register_buffer("discount", torch.tensor(spec.GAMMA))
-        self.register_buffer("object_mean", torch.tensor(OBJECT_MEAN), persistent=False)
-        self.register_buffer("object_std", torch.tensor(OBJECT_STD), persistent=False)
+        scale = robot.depth_max_m / spec.DEPTH_MAX_M
+        self.register_buffer("object_mean", scale * torch.tensor(OBJECT_MEAN), persistent=False)
+        self.register_buffer("object_std", scale * torch.tensor(OBJECT_STD), persistent=False)
 
     def _value_head(self, outputs: int) -> SplitMlp:
         c = self.config
-        return SplitMlp((c.hidden, c.latent, spec.ACTION_DIM), c.units, outputs, hidden_layers=2)
+        sizes = (c.hidden, c.latent, self.robot.action_dim)
+        return SplitMlp(sizes, c.units, outputs, hidden_layers=2)
 
     def _start_at_zero(self) -> None:
         """Value and termination heads predict constants before training."""

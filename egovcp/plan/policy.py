@@ -18,6 +18,7 @@ from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import PlanEvaluator
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.search import make_plan, shift
+from egovcp.robot_spec import G1, RobotSpec
 
 type Array = NDArray[np.float32]
 
@@ -49,7 +50,8 @@ class Policy:
     prior predicts this step. Depth that is not finite counts as invalid (0).
 
     The recurrence advances with the action that was sent, after the safety layer: pass it to
-    `advance`. The model's weights are packed at the first plan; later changes are not seen.
+    `advance`. The model's weights are packed at the first plan; later changes are not seen. Shapes
+    below are the G1's; those of another robot are in the model's `RobotSpec`.
     """
 
     def __init__(
@@ -69,10 +71,11 @@ class Policy:
         """Reset ``rows`` (None: all, and the random generator)."""
         if rows is None:
             device, envs = self._device, self.num_envs
+            actions = self.model.robot.action_dim
             self._carry = self.model.initial(envs)
-            self._sent = torch.zeros(envs, spec.ACTION_DIM, device=device)
+            self._sent = torch.zeros(envs, actions, device=device)
             self._first = torch.ones(envs, dtype=torch.bool, device=device)
-            self._warm = torch.zeros(envs, self.config.actions, spec.ACTION_DIM, device=device)
+            self._warm = torch.zeros(envs, self.config.actions, actions, device=device)
             self._generator = torch.Generator(device).manual_seed(self._seed)
             return
         index = torch.as_tensor(rows, device=self._device)
@@ -117,8 +120,8 @@ class Policy:
 
     def _check_shapes(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         expected = (
-            (self.num_envs, spec.DEPTH_ROWS, spec.DEPTH_COLS),
-            (self.num_envs, spec.STATE_DIM),
+            (self.num_envs, *self.model.robot.depth),
+            (self.num_envs, self.model.robot.state_dim),
         )
         if (depth.shape, state.shape) != expected:
             raise UsageError(
@@ -171,7 +174,7 @@ class Policy:
             UsageError, EnvironmentFailure: as `prepare`.
         """
         for _ in range(_WARM_UP_PLANS):
-            self.act(*blank_observation(self.num_envs))
+            self.act(*blank_observation(self.num_envs, self.model.robot))
         self.reset()
 
     def prepare(self) -> PlanEvaluator[Carry]:
@@ -226,11 +229,12 @@ class Policy:
         return depth.reshape(-1, horizon, *depth.shape[1:])
 
 
-def blank_observation(num_envs: int) -> tuple[NDArray[np.uint16], Array]:
-    """Depth (E, 48, 64) mm without a valid pixel and state (E, 74) of a robot that is upright."""
-    depth = np.zeros((num_envs, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
-    state = np.zeros((num_envs, spec.STATE_DIM), np.float32)
-    state[:, spec.STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+def blank_observation(num_envs: int, robot: RobotSpec = G1) -> tuple[NDArray[np.uint16], Array]:
+    """Depth (E, H, W) mm without a valid pixel and state (E, S): zeros, or an upright G1."""
+    depth = np.zeros((num_envs, *robot.depth), np.uint16)
+    state = np.zeros((num_envs, robot.state_dim), np.float32)
+    if robot.is_g1:
+        state[:, spec.STATE_SLICES["projected_gravity"].stop - 1] = -1.0
     return depth, state
 
 

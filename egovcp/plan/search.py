@@ -179,7 +179,7 @@ def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tenso
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> SearchState:
     robots = executed.shape[0]
-    shape = (robots, config.actions, spec.ACTION_DIM)
+    shape = (robots, config.actions, executed.shape[-1])
     mean = executed.new_zeros(shape) if warm is None else warm
     unknown = executed.new_full((robots, config.elites), -torch.inf)
     elites = mean[:, None].expand(-1, config.elites, -1, -1)

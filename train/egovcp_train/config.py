@@ -17,6 +17,7 @@ from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_compatible
 from egovcp.plan.config import PAPER_PLANNER, require_affordable
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.records import WandbConfig
 
 
@@ -109,10 +110,14 @@ class PolicyConfig(WorldModelConfig):
                 "--policy.push_to_hub; give that, or leave --policy.repo_id empty"
             )
 
-    def world_model(self) -> WorldModelConfig:
-        """What the networks themselves need to know."""
+    def world_model(self, robot: RobotSpec = G1) -> WorldModelConfig:
+        """What the networks themselves need to know; by default the range of images is that of the
+        robot's camera."""
         names = (f.name for f in fields(WorldModelConfig))
-        return WorldModelConfig(**{name: getattr(self, name) for name in names})
+        config = WorldModelConfig(**{name: getattr(self, name) for name in names})
+        if config.depth_max_m == G1.depth_max_m:
+            config = replace(config, depth_max_m=robot.depth_max_m)
+        return config
 
 
 @dataclass(frozen=True)

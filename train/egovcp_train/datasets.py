@@ -34,6 +34,7 @@ from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
+from egovcp.robot_spec import RobotSpec
 from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
 from egovcp_train.distributed import SINGLE, ProcessGroup
@@ -43,6 +44,7 @@ EVALUATION_EPISODES: Final = 512
 FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
     spec.STATE_DIM + 2 * spec.ACTION_DIM + 8
 )
+"""Of the G1; that of another robot is of the same order."""
 
 _RETURNS: Final = ReturnConfig()
 _MIN_STD: Final = 1e-6
@@ -107,6 +109,11 @@ def _prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup) -> Tra
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
     return TrainingData(readers, config, *build(readers, config, sampling, mix, model, group))
+
+
+def robot_of(config: TrainConfig) -> RobotSpec:
+    """The robot of the data; raises as `open_readers`."""
+    return _open((config.datasets or (config.dataset,))[0], config).robot
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:

@@ -34,7 +34,6 @@ import torch.nn.functional as F
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from egovcp import spec
 from egovcp.artifact import WEIGHTS, Artifact, load_artifact
 from egovcp.cli import run_command
 from egovcp.errors import ArtifactError, UsageError
@@ -299,14 +298,14 @@ def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
     def uniform(*shape: int) -> Tensor:
         return torch.rand(batch, *shape, generator=generator)
 
-    image = (spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    image, robot = model.robot.depth, model.robot
     depth = (uniform(*image) * 1.2e3 * model.config.depth_max_m).floor()
     return {
         "h": normal(model.config.hidden).tanh(),
         "z": normal(model.config.latent),
-        "action": 2.0 * uniform(spec.ACTION_DIM) - 1.0,
+        "action": 2.0 * uniform(robot.action_dim) - 1.0,
         "depth": depth.masked_fill(uniform(*image) < 0.1, 0.0),
-        "state": model.state_mean + 3.0 * model.state_std * normal(spec.STATE_DIM),
+        "state": model.state_mean + 3.0 * model.state_std * normal(robot.state_dim),
         "is_first": torch.arange(batch) % 3 == 0,
     }
 

@@ -38,7 +38,8 @@ def write_half_precision(artifact: Artifact, folder: Path) -> None:
     processors = [name for name in PROCESSORS if name in manifest["files"]]
     read = {n: json.loads((source / n).read_text("utf-8")) for n in (CONFIG, *processors)}
     config = read.pop(CONFIG)
-    write_artifact(folder, config, half_precision_weights(artifact), provenance, read)
+    weights = half_precision_weights(artifact)
+    write_artifact(folder, config, weights, provenance, read, artifact.robot)
     if (source / CURVES).is_file():
         (folder / CURVES).parent.mkdir()
         shutil.copy(source / CURVES, folder / CURVES)

@@ -162,7 +162,9 @@ class Learner:
         if self.target:
             self.target.load_state_dict(state["target"])
         if "privileged_value" in state:
-            self.privileged_value = PrivilegedValue.restore(state["privileged_value"])
+            self.privileged_value = PrivilegedValue.restore(
+                state["privileged_value"], self.model.robot
+            )
             self.privileged_value.to(self.model.state_mean.device)
 
 

@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from egovcp import spec
 from egovcp.data import EpisodeStore
-from egovcp.data.mirror import mirror_action, mirror_state
 from egovcp.data.privileged import mirror_privileged
 from egovcp.model import WorldModel
 from egovcp.model.privileged_value import PrivilegedValue
@@ -34,14 +33,22 @@ type Inputs = tuple[Tensor, ...]
 
 
 class PrivilegedRows:
-    """Inputs and standardised returns of the N rows of episodes whose return is complete."""
+    """Inputs and standardised returns of the N rows of episodes whose return is complete.
+
+    The mirrored inputs of a robot that is not symmetric are its inputs.
+    """
 
     def __init__(self, model: WorldModel, store: EpisodeStore) -> None:
         """The rows of ``store``, on the device of ``model``, whose normalisation is used."""
         rows, device = store.mc_valid, model.state_mean.device
         own = (store.state, store.privileged, store.action)
-        reflections = (mirror_state, mirror_privileged, mirror_action)
-        mirrored = (mirror(x) for mirror, x in zip(reflections, own, strict=True))
+        mirrored, robot = own, store.robot
+        if robot.mirror is not None:
+            mirrored = (
+                robot.mirrored_state(store.state),
+                mirror_privileged(store.privileged),
+                robot.mirrored_action(store.action),
+            )
         self.inputs, self.mirrored = (
             (model.standardise(state), *others)
             for state, *others in (
@@ -96,7 +103,7 @@ def fit(
     features, device = rows.inputs[1], rows.target.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        value = PrivilegedValue(features.shape[-1]).to(device)
+        value = PrivilegedValue(features.shape[-1], model.robot).to(device)
     value.mean.copy_(features.mean(0))
     value.std.copy_(features.std(0).clamp_min(_MIN_STD))
     optimizer = torch.optim.AdamW(
@@ -134,4 +141,4 @@ def prepare(model: WorldModel, data: TrainingData, group: ProcessGroup) -> Privi
         shares = ", ".join(f"{task} {share:.2f}" for task, share in found.items())
         echo(f"the privileged value explains this share of held-out returns: {shares}")
         state = value.cpu().state_dict()
-    return PrivilegedValue.restore(group.broadcast(state)).to(model.state_mean.device)
+    return PrivilegedValue.restore(group.broadcast(state), model.robot).to(model.state_mean.device)

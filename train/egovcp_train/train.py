@@ -24,6 +24,7 @@ from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.packages import require_packages
 from egovcp.plan.backends import make_evaluator
+from egovcp.robot_spec import G1
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
 from egovcp_train import privileged_value
@@ -47,6 +48,7 @@ from egovcp_train.datasets import (
     prepare,
     require_datasets,
     require_same_content,
+    robot_of,
     to_tensors,
 )
 from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
@@ -99,7 +101,8 @@ def train(config: TrainConfig) -> None:
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    model = WorldModel(config.policy.world_model())
+    robot = group.broadcast(robot_of(config) if group.is_first else G1)
+    model = WorldModel(config.policy.world_model(robot), robot)
     initial: dict[str, Tensor] = {}
     if config.policy.pretrained_path and not config.resume:
         initial = pretrained_weights(model, config.policy.pretrained_path)

@@ -11,8 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from egovcp import spec
-from egovcp.data import Episode, schema
+from egovcp.data import Episode, metadata, schema
 from egovcp.data.lerobot import episode_runs
 from egovcp.data.parquet import (
     EPISODE_FEATURES,
@@ -23,6 +22,7 @@ from egovcp.data.parquet import (
 )
 from egovcp.data.paths import files_below
 from egovcp.errors import DataError
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp_collect.dataset.record_index import Record
 
 _TIMESTAMP_TOLERANCE_S: Final = 1e-3  # timestamps are float32
@@ -36,6 +36,7 @@ class RecoveredEpisode:
     number: int
     """Its ``episode_index`` in the file."""
     arrays: dict[str, NDArray[Any]]
+    robot: RobotSpec = G1
 
     def episode(self, record: Record) -> Episode:
         """The episode with the task, time limit and metadata of its record."""
@@ -44,6 +45,7 @@ class RecoveredEpisode:
             task=record["task"],
             time_limit=record["time_limit"],
             metadata=record.get("metadata", {}),
+            robot=self.robot,
         )
 
     def digest(self) -> str:
@@ -53,29 +55,40 @@ class RecoveredEpisode:
 
 def recover_episodes(root: Path) -> Iterator[RecoveredEpisode | DataError]:
     """The episodes of all data files in order, and an error for each unreadable part."""
+    robot = _robot(root)
     for path in files_below(root / "data"):
         if path.suffix == ".parquet":
             try:
-                file = open_data_file(root, path)
+                file = open_data_file(root, path, robot)
             except DataError as error:
                 yield error
             else:
                 names = present_columns(schema.FEATURES, file.schema_arrow.names)
                 for found in episode_runs(file, path, names):
-                    yield found if isinstance(found, DataError) else _assemble(path, *found)
+                    yield found if isinstance(found, DataError) else _assemble(path, *found, robot)
 
 
-def _assemble(path: Path, number: int, table: pa.Table) -> RecoveredEpisode | DataError:
+def _robot(root: Path) -> RobotSpec:
+    """The robot of the dataset; the G1 if ``info.json`` cannot be read."""
+    try:
+        return metadata.load_robot(metadata.load_v3_info(root), root / schema.INFO_PATH)
+    except DataError:
+        return G1
+
+
+def _assemble(
+    path: Path, number: int, table: pa.Table, robot: RobotSpec
+) -> RecoveredEpisode | DataError:
     try:
         with data_errors(path):
-            columns = read_columns(table, schema.FEATURES)
+            columns = read_columns(table, schema.FEATURES, robot)
     except DataError as error:
         return DataError.at(path, error.problem or str(error), number, error.frame)
     frames = np.arange(len(table))
-    late = np.abs(columns["timestamp"] - frames / spec.PLANNER_HZ)
+    late = np.abs(columns["timestamp"] - frames / robot.planner_hz)
     wrong = (columns["frame_index"] != frames) | ~(late <= _TIMESTAMP_TOLERANCE_S)
     if wrong.any():
-        problem = f"its frame indices or timestamps do not count at {spec.PLANNER_HZ} Hz from 0"
+        problem = f"its frame indices or timestamps do not count at {robot.planner_hz} Hz from 0"
         return DataError.at(path, problem, number, int(np.argmax(wrong)))
     arrays = {name: columns[key] for name, key in EPISODE_FEATURES.items()}
-    return RecoveredEpisode(path, number, arrays)
+    return RecoveredEpisode(path, number, arrays, robot)

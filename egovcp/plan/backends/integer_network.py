@@ -14,7 +14,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel, value
 from egovcp.model.config import ValueLoss
@@ -111,7 +110,7 @@ class _Packed:
                 f"{library.FLOAT32_HINT}"
             )
         self.network = n = library.CNetwork()
-        n.hidden, n.latent, n.actions = c.hidden, c.latent, spec.ACTION_DIM
+        n.hidden, n.latent, n.actions = c.hidden, c.latent, model.robot.action_dim
         n.min_std = c.min_std
         n.silu, n.tanh = (self._address(t, torch.int16) for t in (silu_table(), tanh_table()))
         z, action = map(weight_of, model.mix.parts)

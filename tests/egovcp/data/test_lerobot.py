@@ -11,7 +11,8 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from egovcp import spec
-from egovcp.data import Episode, schema
+from egovcp.data import Episode
+from egovcp.robot_spec import G1
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_lerobot_reads_every_frame(loaded: LeRobotDataset, episodes: list[Episod
 def test_lerobot_makes_the_same_features(loaded: LeRobotDataset, tmp_path: Path) -> None:
     features = {key: dict(value) for key, value in spec.FEATURES.items()}
     theirs = LeRobotDatasetMetadata.create(
-        "me/reference", spec.PLANNER_HZ, features, schema.ROBOT_TYPE, tmp_path / "reference",
+        "me/reference", spec.PLANNER_HZ, features, G1.robot_type, tmp_path / "reference",
         use_videos=False,
     ).info.to_dict()  # fmt: skip
     ours = loaded.meta.info.to_dict()

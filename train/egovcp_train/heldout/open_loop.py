@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egovcp import spec
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import Rollout, moving_pixels
+from egovcp.robot_spec import G1, RobotSpec
 
 HORIZONS: Final = (1, 2, 4, 8, 12, 16)
 CONTEXT: Final = 4  # frames that are filtered before a prediction
@@ -38,13 +38,14 @@ type Errors = dict[str, dict[str, dict[str, float | int | None]]]
 class OpenLoop:
     """Sums of the errors at each horizon over batches of episodes."""
 
-    def __init__(self, stride: int = 4) -> None:
-        """Predict from every ``stride``-th row."""
+    def __init__(self, stride: int = 4, robot: RobotSpec = G1) -> None:
+        """Predict the observations of ``robot`` from every ``stride``-th row."""
         self.stride = stride
         self._depth = {
             (r, k): torch.zeros(3, dtype=torch.float64) for r in REGIONS for k in HORIZONS
         }
-        shape = (2, spec.STATE_DIM)
+        self._robot = robot
+        shape = (2, robot.state_dim)
         self._state = {k: torch.zeros(shape, dtype=torch.float64) for k in HORIZONS}
         self._rows = dict.fromkeys(HORIZONS, 0)
 
@@ -106,9 +107,9 @@ class OpenLoop:
         return out
 
     def state(self) -> Errors:
-        """Group of `spec.STATE_SLICES` -> horizon -> model, repeat (None without rows), rows."""
+        """`RobotSpec.state_slices` -> horizon -> model, repeat (None without rows), rows."""
         out: Errors = {}
-        for group, part in spec.STATE_SLICES.items():
+        for group, part in self._robot.state_slices.items():
             out[group] = {}
             for k, (model, repeat) in self._state.items():
                 n = self._rows[k]

@@ -17,6 +17,7 @@ from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.latent_state import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.datasets import to_tensors
 from egovcp_train.heldout.open_loop import OpenLoop, Strip, most_interesting, strips
 
@@ -174,9 +175,9 @@ class HeldoutReport(NamedTuple):
 class TaskMeasurements:
     """Measurements of one task, summed over batches of its episodes."""
 
-    def __init__(self, stride: int) -> None:
+    def __init__(self, stride: int, robot: RobotSpec = G1) -> None:
         self.episodes = self.rows = 0
-        self.open_loop = OpenLoop(stride)
+        self.open_loop = OpenLoop(stride, robot)
         self.termination: list[TerminationRows] = []
         self.strips: list[Strip] = []
         self.kl = torch.zeros(0)
@@ -261,7 +262,7 @@ def measure(
     for task, batch, open_loop in episodes:
         if stopped():
             break
-        tasks.setdefault(task, TaskMeasurements(stride)).add(model, batch, open_loop)
+        tasks.setdefault(task, TaskMeasurements(stride, model.robot)).add(model, batch, open_loop)
     if not tasks:
         if stopped():
             raise KeyboardInterrupt
