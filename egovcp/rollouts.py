@@ -13,9 +13,10 @@ import numpy as np
 from egovcp.data import DatasetReader, Episode
 from egovcp.errors import DataError
 from egovcp.log.tick import CameraView, RunInfo, Tick
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ
+from egovcp.robot_spec import RobotSpec
+from egovcp.spec import PLANNER_HZ
 
-TICK_NS: Final = 1_000_000_000 // PLANNER_HZ
+NS_PER_S: Final = 1_000_000_000
 #: Key of `RunInfo.hashes` that names the low-level controller.
 CONTROLLER: Final = "low_level_controller"
 POSE: Final = (
@@ -44,6 +45,8 @@ def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
             "command": known.get("command", ""),
         },
         hashes={CONTROLLER: reader.controller_id, "dataset commit": reader.source.commit},
+        fps=reader.fps,
+        robot=reader.robot,
         versions=dict(known.get("versions", {})),
     )
 
@@ -61,11 +64,12 @@ def camera_view(config: Mapping[str, Any], facts: Mapping[str, Any]) -> CameraVi
 
 def ticks_of(episode: Episode) -> Iterator[Tick]:
     """The rows of an episode as ticks."""
+    period_ns = NS_PER_S // episode.robot.planner_hz
     for t in range(len(episode)):
         ended = bool(episode.done[t])
         yield Tick(
             index=t,
-            time_ns=t * TICK_NS,
+            time_ns=t * period_ns,
             depth=episode.depth[t],
             state=episode.state[t],
             action_planned=episode.action[t],
@@ -89,9 +93,10 @@ def _events(episode: Episode, t: int) -> Iterator[str]:
         yield "a fall ends the episode" if episode.terminated else "the time is up"
 
 
-def follows(before: Tick, tick: Tick) -> bool:
+def follows(before: Tick, tick: Tick, fps: int = PLANNER_HZ) -> bool:
     """Whether ``tick`` follows ``before`` by one period, so that both can be rows of an episode."""
-    late = abs(tick.time_ns - before.time_ns - TICK_NS) > TICK_NS / 2
+    period_ns = NS_PER_S // fps
+    late = abs(tick.time_ns - before.time_ns - period_ns) > period_ns / 2
     return tick.index == before.index + 1 and not late
 
 
@@ -109,7 +114,7 @@ def episode_of(info: RunInfo, ticks: Sequence[Tick]) -> Episode:
     length, last = len(ticks), np.arange(len(ticks)) == len(ticks) - 1
     fallen = ticks[-1].terminated
     episode = Episode(
-        depth=np.stack([_depth(tick) for tick in ticks]),
+        depth=np.stack([_depth(tick, info.robot) for tick in ticks]),
         state=np.stack([tick.state for tick in ticks]).astype(np.float32),
         action=np.stack([tick.action_sent for tick in ticks]).astype(np.float32),
         reward=np.array([tick.reward for tick in ticks], np.float32),
@@ -118,16 +123,16 @@ def episode_of(info: RunInfo, ticks: Sequence[Tick]) -> Episode:
         truncated=last & (not fallen),
         task=info.task,
         time_limit=max(length, planned_ticks(info)) if fallen else length,
+        robot=info.robot,
     )
     facts = _facts(info, episode)
     return Episode(**{**vars(episode), "metadata": facts})
 
 
-def _depth(tick: Tick) -> np.ndarray[Any, np.dtype[np.uint16]]:
-    if tick.depth.shape != (DEPTH_ROWS, DEPTH_COLS):
+def _depth(tick: Tick, robot: RobotSpec) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    if tick.depth.shape != robot.depth:
         raise DataError(
-            f"tick {tick.index}: depth of {tick.depth.shape} pixels, "
-            f"expected {(DEPTH_ROWS, DEPTH_COLS)}"
+            f"tick {tick.index}: depth of {tick.depth.shape} pixels, expected {robot.depth}"
         )
     return tick.depth
 

@@ -11,11 +11,14 @@ from egovcp import spec
 from egovcp.data.episode import Episode
 from egovcp.data.privileged import DIM as PRIVILEGED_DIM
 from egovcp.model import PRESETS, Batch, WorldModel, WorldModelConfig
+from egovcp.robot_spec import G1, RobotSpec
 
 __all__ = ["random_batch", "random_episode", "toy_model"]
 
 
-def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldModel:
+def toy_model(
+    preset: str | WorldModelConfig = "debug", seed: int = 0, robot: RobotSpec = G1
+) -> WorldModel:
     """An untrained world model whose value, termination and reward heads depend on their inputs.
 
     The last layers of a new `WorldModel` are zero, so its predictions are constants, which would
@@ -23,7 +26,7 @@ def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldM
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset)
+        model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset, robot)
         for head in (model.value_head, model.termination_head, model.reward_head):
             if head is not None:
                 last = head.rest[-1]
@@ -59,7 +62,12 @@ def random_batch(size: int = 4, length: int = 8, seed: int = 0) -> Batch:
 
 
 def random_episode(
-    number: int, length: int = 12, time_limit: int | None = None, task: str = "ball", seed: int = 0
+    number: int,
+    length: int = 12,
+    time_limit: int | None = None,
+    task: str = "ball",
+    seed: int = 0,
+    robot: RobotSpec = G1,
 ) -> Episode:
     """A valid episode of noise whose commanded targets agree with its actions.
 
@@ -68,15 +76,15 @@ def random_episode(
     rng = np.random.default_rng((seed, number))
     limit = time_limit or length
     last = np.arange(length) == length - 1
-    pixels = (length, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    depth = rng.integers(280, 5000, pixels).astype(np.uint16)
+    pixels = (length, *robot.depth)
+    depth = rng.integers(280, round(1000 * robot.depth_max_m), pixels).astype(np.uint16)
     depth[rng.random(pixels) < 0.1] = 0
-    action = rng.uniform(-1, 1, (length, spec.ACTION_DIM)).astype(np.float32)
+    action = rng.uniform(-1, 1, (length, robot.action_dim)).astype(np.float32)
     terms = rng.normal(size=(length, len(spec.REWARD_TERMS))).astype(np.float32)
     terms[:, -len(spec.ACTION_TERMS) :] = 0.0  # not in the target of Q
     return Episode(
         depth=depth,
-        state=_state(rng, action),
+        state=_state(rng, action, robot),
         action=action,
         reward=terms.sum(1),
         done=last,
@@ -87,12 +95,17 @@ def random_episode(
         metadata={"seed": seed, "episode": number, "ball": {"radius": 0.1}},
         reward_terms=terms,
         object=np.column_stack([rng.normal(size=(length, 3)), np.ones(length)]).astype(np.float32),
+        robot=robot,
     )
 
 
-def _state(rng: np.random.Generator, action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(T, 74) proprioception whose command is the previous action."""
-    state = rng.normal(size=(len(action), spec.STATE_DIM)).astype(np.float32)
+def _state(
+    rng: np.random.Generator, action: NDArray[np.float32], robot: RobotSpec
+) -> NDArray[np.float32]:
+    """(T, S) proprioception; of the G1, its command is the previous action."""
+    state = rng.normal(size=(len(action), robot.state_dim)).astype(np.float32)
+    if not robot.is_g1:
+        return state
     before = np.vstack([np.zeros((1, spec.ACTION_DIM)), action[:-1]])
     hands, height = spec.STATE_SLICES["command_hands"], spec.STATE_SLICES["command_height"]
     state[:, hands.start : height.stop] = spec.ACTION_BOX.to_metric(before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 import sys
@@ -22,9 +23,11 @@ from egovcp.data.committer import Committer, open_committer
 from egovcp.data.source import local_root
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import require_packages
+from egovcp.robot_spec import G1
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import find_task
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_collect.config import PRESETS, CollectConfig
@@ -42,7 +45,7 @@ STAGED_FRAME_BYTES: Final = (
     + 2 * spec.DEPTH_ROWS * spec.DEPTH_COLS
     + 4 * (spec.STATE_DIM + spec.ACTION_DIM + 1 + len(spec.REWARD_TERMS) + spec.OBJECT_DIM)
 )
-"""Bytes of a frame in a staged episode, which is not compressed."""
+"""Bytes of a frame of the G1 in a staged episode, which is not compressed."""
 MIN_COMPRESSED_SHARE: Final = 0.2
 """Lower bound of the compressed size of a frame as a share of `STAGED_FRAME_BYTES`."""
 
@@ -130,7 +133,11 @@ def min_bytes(scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int
     ticks = [env.episode(scenario.task).ticks for scenario in scenarios]
     uncompressed = sum(ticks[:shard_episodes])
     share = MIN_COMPRESSED_SHARE
-    return round(STAGED_FRAME_BYTES * (share * sum(ticks) + (1 - share) * uncompressed))
+    frame = STAGED_FRAME_BYTES
+    if scenarios:
+        robot = find_task(scenarios[0].task).robot_spec()
+        frame += 2 * (math.prod(robot.depth) - math.prod(G1.depth))
+    return round(frame * (share * sum(ticks) + (1 - share) * uncompressed))
 
 
 def require_disk_space(

@@ -12,7 +12,7 @@ import draccus
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
 from egovcp.flags import merged
-from egovcp.robot.controllers import make_controller
+from egovcp.sim.robot_env import controller_id_of
 from egovcp.sim.tasks.registry import ALL_TASKS, task_names
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 
@@ -24,7 +24,7 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
     """What ``meta/collection.json`` records of a collection."""
     settings = draccus.encode(config)
     return Provenance(
-        controller_id=make_controller(config.env.controller).id,
+        controller_id=controller_id_of(config.env, config.tasks),
         seed=config.seed,
         command=command,
         versions=installed_versions(),

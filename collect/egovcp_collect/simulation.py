@@ -5,23 +5,23 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import Episode
-from egovcp.sim.env import Observation, StepResult, VectorEnv
+from egovcp.sim.env import BaseVectorEnv, Observation, StepResult
 from egovcp.sim.instance import EnvInstance
 from egovcp.sim.policies import RandomWalk
+from egovcp.sim.robot_env import RobotInstance, make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HANDS
 from egovcp.spec import REWARD_TERMS
 from egovcp_collect.config import CollectConfig
 
 #: Called with the environment and (B,) whether the episode of each row is running.
-type StepCallback = Callable[[VectorEnv, NDArray[np.bool_]], None]
+type StepCallback = Callable[[BaseVectorEnv, NDArray[np.bool_]], None]
 
 
 type SimulationResult = tuple[int, list[tuple[int, Episode]]]
@@ -47,7 +47,7 @@ class Simulation:
         self._render_depth = render_depth
         self._waiting: deque[Scenario] = deque()
         self._policy = RandomWalk(config.eta, config.boundary, config.step_ticks)
-        self._env: VectorEnv | None = None
+        self._env: BaseVectorEnv | None = None
         self._observation: Observation
         self._records: list[EpisodeRecord]
 
@@ -80,13 +80,13 @@ class Simulation:
             self._observation = result.observation
         return steps, episodes
 
-    def _start_waiting(self) -> VectorEnv:
+    def _start_waiting(self) -> BaseVectorEnv:
         """The environment, after waiting episodes were started in its finished rows."""
         config, env = self._config, self._env
         if env is None:
             scenarios = self._take(config.num_envs)
             self._records = [EpisodeRecord() for _ in scenarios]
-            env = VectorEnv(config.env, len(scenarios), render_depth=self._render_depth)
+            env = make_env(config.env, len(scenarios), config.tasks, self._render_depth)
             self._env = env
             self._observation = env.reset(scenarios)
             self._policy.reset(env, scenarios)
@@ -116,7 +116,7 @@ class EpisodeRecord:
         known_object: NDArray[np.float32],
         result: StepResult,
         row: int,
-        instance: EnvInstance,
+        instance: EnvInstance | RobotInstance,
     ) -> None:
         """Append row ``row`` of the environment: the observation before a step, the object (4,) at
         that time, and the result of the step."""
@@ -141,30 +141,34 @@ class EpisodeRecord:
         for name in columns:
             self._term_sums[name] += terms[name]
             self._term_ticks[name] += terms[name] != 0
-        touched = instance.task.forces > 0
-        hands = touched[list(HANDS)]
-        self._hand_contacts += int(hands.any())
-        self._other_contacts += int(touched.sum() > hands.sum())
+        if isinstance(instance, EnvInstance):
+            touched = instance.task.forces > 0
+            hands = touched[list(HANDS)]
+            self._hand_contacts += int(hands.any())
+            self._other_contacts += int(touched.sum() > hands.sum())
 
-    def episode(self, instance: EnvInstance) -> Episode:
+    def _contacts(self, instance: EnvInstance | RobotInstance) -> dict[str, Any]:
+        """Contacts of the parts of a G1."""
+        if not isinstance(instance, EnvInstance):
+            return {}
+        return {"contact_ticks": {"hands": self._hand_contacts, "other": self._other_contacts}}
+
+    def episode(self, instance: EnvInstance | RobotInstance) -> Episode:
         """The finished episode."""
+        rows: dict[str, Any] = {name: np.stack(values) for name, values in self._rows.items()}
         return Episode(
-            **{name: np.stack(values) for name, values in self._rows.items()},
+            **rows,
+            robot=instance.task.robot_spec(),
             task=instance.scenario.task,
             time_limit=instance.task.ticks_limit,
             metadata={
                 "seed": instance.scenario.seed,
                 "episode": instance.scenario.episode,
-                "event_tick": instance.task.event_tick,
-                "action_delay": instance.action_delay,
-                "image_age": instance.image_age,
-                "camera_pitch": instance.camera_pitch,
-                "physics": asdict(instance.physics),
-                "scene": instance.task.parameters,
+                **instance.metadata,
                 "reward_terms": {
                     name: {"sum": self._term_sums[name], "ticks": self._term_ticks[name]}
                     for name in instance.task.reward_terms
                 },
-                "contact_ticks": {"hands": self._hand_contacts, "other": self._other_contacts},
+                **self._contacts(instance),
             },
         )

@@ -3,7 +3,6 @@ for the best constant action."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,11 +14,11 @@ from numpy.typing import NDArray
 from egovcp.errors import DataError
 from egovcp.files import UnsafeFileError, read_json
 from egovcp.plan import PolicyStep
-from egovcp.sim.env import VectorEnv
+from egovcp.sim.env import BaseVectorEnv
 from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
 from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks.registry import find_task
+from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.options import PLANNER, for_search
 from egovcp_deploy.scores import EpisodeScore, reward_per_step
@@ -39,7 +38,7 @@ _FIRST_ROUND: Final = 6  # scenarios that every candidate plays
 def reference(name: str, action: Action = ()) -> SimPolicy:
     """``hold``, ``random``, ``oracle``, or ``constant`` with its ``action``."""
     if name == CONSTANT:
-        return Constant(action)
+        return Constant(action, len(action))
     policies: dict[str, type[SimPolicy]] = {"hold": Hold, "random": RandomWalk, "oracle": Oracle}
     return policies[name]()
 
@@ -49,7 +48,7 @@ class ReferencePolicy:
     ``scenarios()`` are those of the present episodes."""
 
     def __init__(
-        self, policy: SimPolicy, env: VectorEnv, scenarios: Callable[[], Sequence[Scenario]]
+        self, policy: SimPolicy, env: BaseVectorEnv, scenarios: Callable[[], Sequence[Scenario]]
     ) -> None:
         self._policy, self._env, self._scenarios = policy, env, scenarios
 
@@ -85,13 +84,10 @@ class BestConstant:
 
 
 def grid(task: str) -> list[Action]:
-    """Candidates: left-right symmetric poses, the neutral pose among them; see
-    `Task.constant_poses`."""
-    neutral = (0.0,) * ACTION_DIM
-    poses = [
-        (forward, outward, up, forward, 0.0 - outward, up, height)
-        for forward, outward, up, height in itertools.product(*find_task(task).constant_poses)
-    ]
+    """Candidates: `BaseTask.constant_actions`, and the neutral pose."""
+    kind = find_task(task)
+    neutral = (0.0,) * kind.robot_spec().action_dim
+    poses = kind.constant_actions()
     return [neutral, *[pose for pose in poses if pose != neutral]]
 
 
@@ -118,7 +114,7 @@ def load_constants(path: Path) -> dict[str, BestConstant]:
     """Task -> result, from the ``constant.json`` of an earlier evaluation; raises `DataError` if
     it is missing or of another format."""
     try:
-        return {task: _parse(entry) for task, entry in read_json(path).items()}
+        return {task: _parse(task, entry) for task, entry in read_json(path).items()}
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"cannot read --constant.path={path}: {reason}") from error
@@ -128,8 +124,9 @@ def load_constants(path: Path) -> dict[str, BestConstant]:
         ) from error
 
 
-def _parse(entry: dict[str, Any]) -> BestConstant:
+def _parse(task: str, entry: dict[str, Any]) -> BestConstant:
     action = tuple(float(value) for value in entry["action"])
-    if len(action) != ACTION_DIM or not np.all(np.abs(action) <= 1.0):
-        raise ValueError(f"expected {ACTION_DIM} numbers from -1 to 1, found {action}")
+    size = find_task(task).robot_spec().action_dim if task in task_names() else ACTION_DIM
+    if len(action) != size or not np.all(np.abs(action) <= 1.0):
+        raise ValueError(f"expected {size} numbers from -1 to 1, found {action}")
     return BestConstant(**entry | {"action": action})

@@ -81,7 +81,12 @@ def check_options(config: DeployConfig) -> None:
         raise UsageError("--robot.recordings is missing; name an MCAP file, or a folder of them")
     if robot == "sim":
         require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
-        find_task(config.task, "--task")
+        kind = find_task(config.task, "--task")
+        if config.realtime and not kind.robot_spec().is_g1:
+            raise UsageError(
+                f"--realtime drives the G1, and the task {config.task} is of robot "
+                f"{kind.robot_spec().robot_type}; leave it out"
+            )
     if config.robot.camera.type == "realsense":
         require_realsense()
     check_output_dir(config.output_dir)

@@ -23,7 +23,8 @@ from egovcp.plan import blank_observation
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import VectorEnv
+from egovcp.sim.env import BaseVectorEnv
+from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import PPO, ReferencePolicy, reference
@@ -63,7 +64,7 @@ class EpisodePlayer:
     def __init__(self, setup: EpisodeSetup, artifact: Artifact | None = None) -> None:
         self._setup = setup
         self._artifact = artifact
-        self._envs: dict[int, VectorEnv] = {}
+        self._envs: dict[int, BaseVectorEnv] = {}
         self._policies: dict[tuple[str, int], RolloutPolicy] = {}
 
     def play(
@@ -72,14 +73,14 @@ class EpisodePlayer:
         """Scores in the order of the group's scenarios; see `play`."""
         if stopped():
             return []
-        size = len(group.scenarios)
+        size, task = len(group.scenarios), group.scenarios[0].task
         if size not in self._envs:
-            self._envs[size] = VectorEnv(self._setup.env, size)
+            self._envs[size] = make_env(self._setup.env, size, [task])
         env = self._envs[size]
         recorder = VideoRecorder(group.videos)
         return play(env, self._policy(group, env), group.scenarios, stopped, recorder)
 
-    def _policy(self, group: EpisodeGroup, env: VectorEnv) -> RolloutPolicy:
+    def _policy(self, group: EpisodeGroup, env: BaseVectorEnv) -> RolloutPolicy:
         if group.controller not in (PPO, PLANNER):
             policy = reference(group.controller, group.action)
             return ReferencePolicy(policy, env, lambda: group.scenarios)
@@ -87,7 +88,7 @@ class EpisodePlayer:
         if key not in self._policies:
             learned = self._policies[key] = self._learned(*key)
             for _ in range(2):  # the first calls compile and allocate, and must not be timed
-                learned.act(*blank_observation(env.num_envs))
+                learned.act(*blank_observation(env.num_envs, env.robot))
         return self._policies[key]
 
     def _learned(self, controller: str, robots: int) -> RolloutPolicy:
@@ -100,7 +101,7 @@ class EpisodePlayer:
 
 
 def play(
-    env: VectorEnv,
+    env: BaseVectorEnv,
     policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
     stopped: Callable[[], bool] = lambda: False,
@@ -113,7 +114,7 @@ def play(
     observation = env.reset(scenarios)
     policy.reset()
     num_envs = env.num_envs
-    safety = SafetyFilter(num_envs)
+    safety = SafetyFilter(num_envs, env.robot.action_dim)
     rewards, plan_ms = np.zeros(num_envs), list[float]()
     steps, skipped = np.zeros(num_envs, np.int64), np.zeros(num_envs, np.int64)
     success: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)

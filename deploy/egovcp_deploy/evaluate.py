@@ -19,9 +19,9 @@ from egovcp.hardware import available_cores
 from egovcp.packages import require_packages
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
-from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config, require_memory_for_robots
 from egovcp.sim.env import resolve_config
+from egovcp.sim.robot_env import controller_id_of
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task, select_tasks
 from egovcp.terminal import echo
@@ -160,7 +160,7 @@ def evaluate(config: EvalConfig) -> None:
     `KeyboardInterrupt` after SIGINT or SIGTERM."""
     config.check()
     config = replace(config, env=resolve_config(config.env, config.tasks))
-    controller_id = make_controller(config.env.controller).id
+    controller_id = controller_id_of(config.env, config.tasks)
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artifact, ppo, backend = None, None, ""
     if PLANNER in config.controller_names:

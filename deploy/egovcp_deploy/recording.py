@@ -17,6 +17,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.sink import Fanout, Sink
 from egovcp.log.tick import CameraView, RunInfo
 from egovcp.packages import is_installed
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo
 from egovcp_deploy.options import versions, video_paths
 
@@ -94,6 +95,7 @@ def run_info(
     backend: str,
     episode: int = 0,
     camera: CameraView | None = None,
+    robot: RobotSpec = G1,
 ) -> RunInfo:
     """The first record of a log; ``backend`` see `backend_of`."""
     files = artifact.manifest["files"] if artifact else {}
@@ -106,6 +108,8 @@ def run_info(
         hashes={"low_level_controller": controller_id, **files},
         versions=versions(),
         backend=backend,
+        fps=robot.planner_hz,
+        robot=robot,
     )
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +21,6 @@ from egovcp.files import write_json
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import NS_PER_S, LockstepClock
-from egovcp.spec import PLANNER_HZ
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir
@@ -43,8 +42,6 @@ from egovcp_deploy.robots.replay import ReplayRobot, open_recordings
 
 if TYPE_CHECKING:
     from egovcp_deploy.robots.sim import SimRobot
-
-_PERIOD_NS: Final = NS_PER_S // PLANNER_HZ
 
 
 @dataclass
@@ -97,7 +94,8 @@ class LockstepRunner:
         self, sink: Sink, on_tick: Callable[[Tick], None] = lambda tick: None
     ) -> RolloutSummary:
         """Play the episode that the robot has started; ``sink`` is open."""
-        self._pilot = Pilot(self._planner, self._limits, State.ARMED)
+        self._period_ns = NS_PER_S // self._robot.spec.planner_hz
+        self._pilot = Pilot(self._planner, self._limits, State.ARMED, self._robot.spec)
         summary = RolloutSummary()
         while not (summary.terminated or summary.truncated):
             tick = self._tick(summary.steps)
@@ -105,7 +103,7 @@ class LockstepRunner:
             summary.add(tick)
             summary.parts = self._parts
             on_tick(tick)
-            self._clock.advance(_PERIOD_NS)
+            self._clock.advance(self._period_ns)
         if self._pilot.supervisor.state is State.DAMP:
             summary.damped = self._pilot.supervisor.reason
         return summary
@@ -130,7 +128,7 @@ class LockstepRunner:
             timing_ms["plan"] = plan.plan_ms
         return Tick(
             index=index,
-            time_ns=index * _PERIOD_NS,
+            time_ns=index * self._period_ns,
             depth=sensed.depth,
             state=sensed.state,
             action_planned=wanted if plan is None else plan.step.action[0],
@@ -145,7 +143,7 @@ class LockstepRunner:
             scene=sensed.scene,
             events=(*self._pilot.take_events(), *outcome.events),
             timing_ms=timing_ms,
-            **planner_fields(plan),
+            **planner_fields(plan, self._robot.spec),
         )
 
     def _plan(self, index: int, sensed: RobotObservation) -> PlanMessage | None:
@@ -160,7 +158,7 @@ class LockstepRunner:
         if state is State.DAMP and before is not State.DAMP:
             self._robot.damp()
         pilot.send_observation(now, sensed.depth, sensed.state)
-        return pilot.receive_plans(now + _PERIOD_NS)
+        return pilot.receive_plans(now + self._period_ns)
 
 
 def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
@@ -218,7 +216,13 @@ def _play(
             for episode in range(config.episodes):
                 robot.start(episode)
                 info = run_info(
-                    config, robot.controller_id, artifact, backend, episode, robot.camera
+                    config,
+                    robot.controller_id,
+                    artifact,
+                    backend,
+                    episode,
+                    robot.camera,
+                    robot.spec,
                 )
                 with recording(folder, episode, info, config.log, blocking=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))

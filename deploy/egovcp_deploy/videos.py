@@ -8,8 +8,8 @@ from pathlib import Path
 from egovcp.log.tick import Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import NS_PER_S
-from egovcp.sim.env import Observation, VectorEnv
-from egovcp.spec import PLANNER_HZ
+from egovcp.robot_spec import G1
+from egovcp.sim.env import BaseVectorEnv, Observation
 from egovcp_deploy.options import video_paths
 from egovcp_deploy.pilot.planner import RolloutPolicy
 from egovcp_deploy.robots.sim import true_poses
@@ -24,26 +24,27 @@ class VideoRecorder:
 
     def __init__(self, stems: Sequence[Path]) -> None:
         self._stems = stems
+        self._robot = G1
         self._ticks: list[list[Tick]] = [[] for _ in stems]
 
     def add(
-        self, env: VectorEnv, observation: Observation, policy: RolloutPolicy, step: PolicyStep
+        self, env: BaseVectorEnv, observation: Observation, policy: RolloutPolicy, step: PolicyStep
     ) -> None:
         """Keep o_t and what the model imagines; call it before ``env`` advances."""
+        self._robot = env.robot
         rows = [i for i in range(len(self._stems)) if not env.done[i]]
         if not rows:
             return
         from egovcp.log.picture import AHEAD
 
-        truth = env.privileged_state()
         imagined = policy.imagine(step.plan, AHEAD) if isinstance(policy, Policy) else None
         for i in rows:
-            base, scene = true_poses(truth, i)
+            base, scene = true_poses(env, i)
             index = len(self._ticks[i])
             self._ticks[i].append(
                 Tick(
                     index=index,
-                    time_ns=index * NS_PER_S // PLANNER_HZ,
+                    time_ns=index * NS_PER_S // env.robot.planner_hz,
                     depth=observation.depth[i].copy(),
                     state=observation.state[i].copy(),
                     action_planned=step.action[i],
@@ -61,4 +62,4 @@ class VideoRecorder:
         from egovcp.log.picture import write_videos
 
         for stem, ticks in zip(self._stems, self._ticks, strict=True):
-            write_videos(ticks, video_paths(stem))
+            write_videos(ticks, video_paths(stem), self._robot)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from egovcp.checks.environment import check_env
 from egovcp.errors import ConformanceError
-from egovcp.spec import PLANNER_DT
 
 if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
@@ -56,14 +55,14 @@ def check_task(
         EnvironmentFailure: the task is defective: its scene does not compile, or a reward is NaN.
     """
     from egovcp.sim.config import evaluation_config
-    from egovcp.sim.env import VectorEnv
     from egovcp.sim.policies import Hold, Oracle, RandomWalk
+    from egovcp.sim.robot_env import make_env
     from egovcp.sim.scenario import Scenario
     from egovcp.sim.tasks.registry import find_task, register_task
 
     name = register_task(task) if ":" in task else task
     kind = find_task(name)
-    env = VectorEnv(config or evaluation_config(), episodes)
+    env = make_env(config or evaluation_config(), episodes, [name])
     scenarios = [Scenario(name, CHECK_SEED + seed, i) for i in range(episodes)]
     check_env(env, scenarios, _ENV_TICKS)
     first, started = _Run(env, RandomWalk(), scenarios), time.perf_counter()
@@ -143,7 +142,6 @@ class _Run:
         ]
 
     def _check(self, row: int, result: Any) -> None:
-        from egovcp.sim.tasks.base import Task
         from egovcp.sim.tasks.options import MAX_REWARD
 
         instance = self._env.instances[row]
@@ -159,13 +157,20 @@ class _Run:
         _require(np.isclose(total, result.reward[row]), self._task, where, differs)
         if result.terminated[row]:
             upright = f"the episode ended although the robot stands (success: {task.achieved})"
-            _require(Task.has_fallen(task), self._task, where, upright)
+            _require(_has_fallen(task), self._task, where, upright)
         if result.truncated[row] and type(task).for_training:  # a sequence ends after its last part
             early = f"the episode ended after {instance.tick} of {task.ticks_limit} ticks"
             _require(instance.tick == task.ticks_limit, self._task, where, early)
         place = task.state().position_w
         numbers = np.shape(place) == (3,) and (np.isfinite(place).all() or np.isnan(place).all())
         _require(numbers, self._task, where, f"the position of its object is {place}")
+
+
+def _has_fallen(task: Any) -> bool:
+    """Whether the robot of a task fell; of another robot than the G1 what its task says."""
+    from egovcp.sim.tasks.base import Task
+
+    return Task.has_fallen(task) if isinstance(task, Task) else bool(task.has_fallen())
 
 
 def _require_equal(task: str, a: _Episode, b: _Episode) -> None:
@@ -179,7 +184,7 @@ def _require_equal(task: str, a: _Episode, b: _Episode) -> None:
             differs = (values[:n] != other[:n]).reshape(n, -1).any(axis=1)
             at = int(np.argmax(differs)) if differs.any() else n
             raise ConformanceError(
-                f"task {task}, episode {a.number}, {(at + 1) * PLANNER_DT:.2f} s: {name} differs "
+                f"task {task}, episode {a.number}, tick {at + 1}: {name} differs "
                 "in a second run with the same actions; use scenario.rng and reset what __init__ "
                 "and place set"
             )

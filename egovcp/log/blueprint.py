@@ -7,6 +7,7 @@ from typing import Final
 import rerun.blueprint as rrb
 
 from egovcp.log import paths
+from egovcp.robot_spec import RobotSpec
 
 _DARK: Final = [24, 26, 32]
 _FRONT: Final = (1.9, 1.5, 1.2)  # shows both hands and approaching objects
@@ -82,6 +83,36 @@ def signals_blueprint() -> rrb.Blueprint:
             rrb.Vertical(_scene(_SIDE), _depth_view(), row_shares=[3, 2]),
             rrb.Vertical(*curves, tabs),
             column_shares=[1, 1],
+        )
+    )
+
+
+def robot_blueprint(robot: RobotSpec) -> rrb.Blueprint:
+    """Layout for a robot of another kind than the G1: scene and depth images; plan and signals."""
+    decoded = rrb.Spatial2DView(name="reconstructed", origin=paths.RECONSTRUCTED)
+    imagined = rrb.Spatial2DView(name="imagined", origin=f"{paths.IMAGINED}/0")
+    plan = {
+        "value of the plan": f"{paths.PLAN}/value",
+        "termination probability": f"{paths.PLAN}/termination",
+    }
+    states = {name: f"{paths.STATE}/{name}" for name in robot.state_slices}
+    tabs = rrb.Tabs(
+        *(rrb.TimeSeriesView(name=name, origin=path) for name, path in states.items()),
+        rrb.TextLogView(name="events", origin=paths.EVENTS),
+        rrb.TextDocumentView(name="run", origin=paths.INFO),
+    )
+    scene = rrb.Spatial3DView(
+        name="scene", origin=paths.WORLD, contents=[f"{paths.SCENE}/**"], background=_DARK
+    )
+    return _blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(scene, rrb.Horizontal(_depth_view(), decoded, imagined)),
+            rrb.Vertical(
+                _curves({"reward": paths.REWARD, "done, success": paths.OUTCOME}),
+                _curves(plan),
+                _curves({"action in [-1, 1]": f"{paths.ACTION}/normalised"}),
+                tabs,
+            ),
         )
     )
 

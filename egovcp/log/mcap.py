@@ -177,11 +177,11 @@ class McapSink:
     def open(self, info: RunInfo) -> None:
         """Create the file and write the metadata record."""
         self._file.open(info.to_metadata())
-        self._view = info.camera
+        self._view, self._robot = info.camera, info.robot
 
     def write(self, tick: Tick) -> None:
         """Write the messages of the tick and flush the file."""
-        for topic, message in encode_tick(tick, self._view).items():
+        for topic, message in encode_tick(tick, self._view, self._robot).items():
             self._file.add(_recorded_topic(topic), tick.index, tick.time_ns, message)
         self._file.flush()
 

@@ -24,7 +24,8 @@ from egovcp.log.tick import (
 )
 from egovcp.robot.geometry import quaternion
 from egovcp.robot.kinematics import LINK_NAMES
-from egovcp.spec import ACTION_NAMES, DEPTH_COLS, JOINT_NAMES, STATE_NAMES, STATE_SLICES
+from egovcp.robot_spec import G1, RobotSpec
+from egovcp.spec import JOINT_NAMES, STATE_SLICES
 
 CAMERA_FRAME: Final = "head_camera_optical"
 _NO_FRAME: Final = ""  # in the camera frame, viewers would draw decoded points into the scene
@@ -40,8 +41,6 @@ CANDIDATE_FIELDS: Final = ("x", "y", "z", "value")
 #: Number of temperatures per motor -> their names.
 TEMPERATURE_SENSORS: Final = {1: ("motor",), 2: ("casing", "winding")}
 _JOINTS: Final = ",".join(JOINT_NAMES)
-_ACTIONS: Final = ",".join(ACTION_NAMES)
-_STATES: Final = ",".join(STATE_NAMES)
 _FLAGS: Final = ("terminated", "truncated", "success")
 MOTOR_STATUS_ROWS: Final = ("faults", "enabled")
 
@@ -98,24 +97,40 @@ def message_type(topic: Topic) -> str:
     return MESSAGE_TYPES.get(topic, "std_msgs/Float64MultiArray")
 
 
-def encode_tick(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
-    """All messages of one tick; topics without data are left out."""
+def encode_tick(tick: Tick, view: CameraView, robot: RobotSpec = G1) -> dict[Topic, bytes]:
+    """All messages of one tick; topics without data are left out.
+
+    Of another robot than the G1, the model of its links and of its camera is not known: there are
+    no transforms, joint states and camera parameters.
+    """
+    if not robot.is_g1:
+        return {
+            **_image_messages(tick),
+            **_policy_messages(tick, robot),
+            **_base_messages(tick),
+            **_plan_messages(tick, robot),
+            **_outcome_messages(tick),
+        }
     pose = robot_pose(tick)
     return {
         **_camera_messages(tick, view),
         Topic.TF: _transform_tree(tick, pose, view),
         **_robot_messages(tick),
-        **_plan_messages(tick),
+        **_base_messages(tick),
+        **_plan_messages(tick, robot),
         **_outcome_messages(tick),
     }
 
 
 def _camera_messages(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
+    info = ros2.camera_info(tick.time_ns, CAMERA_FRAME, view)
+    depth, *others = _image_messages(tick).items()
+    return dict([depth, (Topic.CAMERA_INFO, info), *others])
+
+
+def _image_messages(tick: Tick) -> dict[Topic, bytes]:
     t = tick.time_ns
-    messages = {
-        Topic.DEPTH: ros2.image_16uc1(t, CAMERA_FRAME, tick.depth),
-        Topic.CAMERA_INFO: ros2.camera_info(t, CAMERA_FRAME, view),
-    }
+    messages = {Topic.DEPTH: ros2.image_16uc1(t, CAMERA_FRAME, tick.depth)}
     if tick.depth_reconstructed is not None:
         image = to_millimetres(tick.depth_reconstructed)
         messages[Topic.RECONSTRUCTED] = ros2.image_16uc1(t, _NO_FRAME, image)
@@ -142,17 +157,27 @@ def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
     effort = () if tick.motors is None else tick.motors.torque
     messages = {
         Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity, effort),
-        Topic.STATE: ros2.multi_array(tick.state, [_STATES]),
-        Topic.ACTION: ros2.multi_array(tick.action_sent, [_ACTIONS]),
-        Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [_ACTIONS]),
+        **_policy_messages(tick, G1),
     }
     if tick.motors is not None:
         messages |= _motor_messages(tick.motors)
-    if tick.base is not None:
-        messages[Topic.BASE] = ros2.pose_stamped(
-            tick.time_ns, tick.base.position_w, tick.base.quaternion_w
-        )
     return messages
+
+
+def _policy_messages(tick: Tick, robot: RobotSpec) -> dict[Topic, bytes]:
+    states, actions = ",".join(robot.state_names), ",".join(robot.action_names)
+    return {
+        Topic.STATE: ros2.multi_array(tick.state, [states]),
+        Topic.ACTION: ros2.multi_array(tick.action_sent, [actions]),
+        Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [actions]),
+    }
+
+
+def _base_messages(tick: Tick) -> dict[Topic, bytes]:
+    if tick.base is None:
+        return {}
+    position, quaternion_w = tick.base.position_w, tick.base.quaternion_w
+    return {Topic.BASE: ros2.pose_stamped(tick.time_ns, position, quaternion_w)}
 
 
 def _motor_messages(motors: MotorReadings) -> dict[Topic, bytes]:
@@ -170,10 +195,11 @@ def _motor_messages(motors: MotorReadings) -> dict[Topic, bytes]:
     return messages
 
 
-def _plan_messages(tick: Tick) -> dict[Topic, bytes]:
+def _plan_messages(tick: Tick, robot: RobotSpec) -> dict[Topic, bytes]:
     messages = {}
     if tick.plan is not None:
-        messages[Topic.PLAN] = ros2.multi_array(tick.plan, ["step", _ACTIONS])
+        actions = ",".join(robot.action_names)
+        messages[Topic.PLAN] = ros2.multi_array(tick.plan, ["step", actions])
     if tick.candidates is not None:
         cloud = candidate_cloud(tick.candidates)
         messages[Topic.CANDIDATES] = ros2.point_cloud(
@@ -251,7 +277,7 @@ def decode_tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         action_planned=sent if planned is None else _array(planned).astype(np.float32),
         action_sent=sent,
         depth_reconstructed=_metres(messages.get(Topic.RECONSTRUCTED)),
-        depth_imagined=_imagined(messages.get(Topic.IMAGINED)),
+        depth_imagined=_imagined(messages.get(Topic.IMAGINED), messages[Topic.DEPTH].width),
         plan=_array(messages[Topic.PLAN]) if Topic.PLAN in messages else None,
         candidates=_candidates(messages.get(Topic.CANDIDATES)),
         value=plan.get("value"),
@@ -319,9 +345,9 @@ def _metres(message: Any) -> NDArray[np.float64] | None:
     return None if message is None else _image(message) / 1000.0
 
 
-def _imagined(message: Any) -> NDArray[np.float64] | None:
+def _imagined(message: Any, columns: int) -> NDArray[np.float64] | None:
     strip = _metres(message)
-    return None if strip is None else np.stack(np.split(strip, strip.shape[1] // DEPTH_COLS, 1))
+    return None if strip is None else np.stack(np.split(strip, strip.shape[1] // columns, 1))
 
 
 def _candidates(message: Any) -> Candidates | None:

@@ -21,7 +21,7 @@ from egovcp.log.meshes import link_meshes
 from egovcp.log.scene_plot import AXES_OPTIONS, draw_scene
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.packages import require_packages
-from egovcp.spec import DEPTH_MAX_M, PLANNER_DT
+from egovcp.robot_spec import G1, RobotSpec
 
 KEY_FRAMES: Final = 7
 AHEAD: Final = 8  # ticks between the imagining of the shown image and its tick
@@ -59,6 +59,7 @@ class PictureSink:
         """
         self._paths = paths
         self._title = ""
+        self._robot = G1
         self._ticks: list[Tick] = []
 
     def open(self, info: RunInfo) -> None:
@@ -68,6 +69,7 @@ class PictureSink:
                 raise EnvironmentFailure(
                     f"{path} exists already; recordings are never overwritten: choose another"
                 )
+        self._robot = info.robot
         self._title = f"{info.task}, seed {info.seed}, episode {info.episode}"
 
     def write(self, tick: Tick) -> None:
@@ -83,23 +85,25 @@ class PictureSink:
             return
         videos = [path for path in self._paths if path.suffix != ".png"]
         for path in set(self._paths).difference(videos):
-            rollout_picture(ticks, path, self._title)
+            rollout_picture(ticks, path, self._title, self._robot)
         if videos:
-            write_videos(ticks, videos)
+            write_videos(ticks, videos, self._robot)
 
 
-def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
+def rollout_picture(
+    ticks: Sequence[Tick], path: Path, title: str = "", robot: RobotSpec = G1
+) -> None:
     """Draw ``ticks`` (in order, without gaps) into the PNG ``path``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     frames = key_frames(ticks)
-    rows = depth_rows(ticks, frames)
+    rows = depth_rows(ticks, frames, robot)
     height = _TOP_INCH + _ROW_INCH * (1 + len(rows)) + _CURVES_INCH
     figure = Figure(figsize=(2.1 * len(frames) + 0.5, height), facecolor="white")
     FigureCanvasAgg(figure)
-    _draw_images(figure, ticks, frames, rows)
-    _curves(figure, ticks, frames)
+    _draw_images(figure, ticks, frames, rows, robot)
+    _curves(figure, ticks, frames, 1.0 / robot.planner_hz)
     figure.suptitle(title, fontsize=12, y=1.0 - 0.086 / height)
     figure.savefig(path, dpi=110)
 
@@ -120,29 +124,30 @@ def key_frames(ticks: Sequence[Tick], count: int = KEY_FRAMES) -> list[int]:
     return sorted({int(i) for i in np.rint(np.linspace(begin, end, count))})
 
 
-def depth_rows(ticks: Sequence[Tick], frames: Sequence[int]) -> DepthRows:
+def depth_rows(ticks: Sequence[Tick], frames: Sequence[int], robot: RobotSpec = G1) -> DepthRows:
     """The rows of depth images; a row without any image is left out."""
+    before = f"imagined\n{AHEAD / robot.planner_hz:.2f} s before"
     rows: DepthRows = {
         "depth seen": [ticks[i].depth / 1000.0 for i in frames],
         "reconstructed": [ticks[i].depth_reconstructed for i in frames],
-        f"imagined\n{AHEAD * PLANNER_DT:.2f} s before": [imagined_of(ticks, i) for i in frames],
+        before: [imagined_of(ticks, i) for i in frames],
     }
     return {name: row for name, row in rows.items() if any(depth is not None for depth in row)}
 
 
 def _draw_images(
-    figure: Any, ticks: Sequence[Tick], frames: Sequence[int], rows: DepthRows
+    figure: Any, ticks: Sequence[Tick], frames: Sequence[int], rows: DepthRows, robot: RobotSpec
 ) -> None:
     place = _place(figure, _CURVES_INCH, figure.get_figheight() - _TOP_INCH)
     grid = figure.add_gridspec(1 + len(rows), len(frames), hspace=0.04, wspace=0.03, **place)
     meshes = link_meshes(_MESH_GRID_M)
     for column, i in enumerate(frames):
         axes = figure.add_subplot(grid[0, column], **AXES_OPTIONS)
-        draw_scene(axes, ticks[i], meshes)
-        axes.set_title(f"{ticks[i].index * PLANNER_DT:.2f} s", fontsize=9)
+        draw_scene(axes, ticks[i], meshes, robot)
+        axes.set_title(f"{ticks[i].index / robot.planner_hz:.2f} s", fontsize=9)
         for row, (name, images) in enumerate(rows.items(), start=1):
             axes = figure.add_subplot(grid[row, column])
-            draw_depth(axes, images[column])
+            draw_depth(axes, images[column], robot)
             if column == 0:
                 axes.set_ylabel(name, fontsize=9)
 
@@ -153,24 +158,26 @@ def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
     return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
 
 
-def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
-    """Draw a depth image (48, 64) in m; None: an empty field."""
+def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None, robot: RobotSpec = G1) -> None:
+    """Draw a depth image (H, W) in m; None: an empty field."""
     axes.set(xticks=[], yticks=[])
     if depth_m is None:
         axes.set_facecolor("0.95")
-        axes.set_box_aspect(48 / 64)
+        axes.set_box_aspect(robot.depth[0] / robot.depth[1])
         return
     shown = np.where(np.asarray(depth_m) > 0.0, depth_m, np.nan)
     axes.set_facecolor("0.15")  # colour of invalid pixels
-    axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
+    axes.imshow(shown, cmap="viridis_r", vmin=0.06 * robot.depth_max_m, vmax=robot.depth_max_m)
 
 
-def grey_image(depth_m: NDArray[np.floating], magnify: int = 4) -> NDArray[np.uint8]:
+def grey_image(
+    depth_m: NDArray[np.floating], magnify: int = 4, robot: RobotSpec = G1
+) -> NDArray[np.uint8]:
     """Depth (H, W) in m as an image (H * magnify, W * magnify, 3): near is bright, invalid black.
 
     Video encoders need more than 64 columns.
     """
-    near = np.where(depth_m == 0, 0.0, 255.0 * (1.0 - depth_m / DEPTH_MAX_M))
+    near = np.where(depth_m == 0, 0.0, 255.0 * (1.0 - depth_m / robot.depth_max_m))
     grey = near.clip(0, 255).astype(np.uint8).repeat(magnify, 0).repeat(magnify, 1)
     return np.stack([grey] * 3, -1)
 
@@ -185,19 +192,21 @@ def curves(ticks: Sequence[Tick]) -> Curves:
     return {name: row for name, row in known.items() if any(value is not None for value in row)}
 
 
-def _curves(figure: Any, ticks: Sequence[Tick], frames: Sequence[int]) -> None:
+def _curves(figure: Any, ticks: Sequence[Tick], frames: Sequence[int], dt: float) -> None:
     shown = curves(ticks)
     place = _place(figure, 0.516, 2.021)
     plots = figure.add_gridspec(1, len(shown), wspace=0.13, **place).subplots(squeeze=False)[0]
     for axes, (name, values) in zip(plots, shown.items(), strict=True):
-        _curve(axes, ticks, values, _STYLES[name])
+        _curve(axes, ticks, values, _STYLES[name], dt)
         axes.set_title(name, fontsize=9, loc="left")
         for i in frames:
-            axes.axvline(ticks[i].index * PLANNER_DT, color="0.9", linewidth=1, zorder=0)
+            axes.axvline(ticks[i].index * dt, color="0.9", linewidth=1, zorder=0)
 
 
-def _curve(axes: Any, ticks: Sequence[Tick], values: list[float | None], style: str) -> None:
-    time = [tick.index * PLANNER_DT for tick in ticks]
+def _curve(
+    axes: Any, ticks: Sequence[Tick], values: list[float | None], style: str, dt: float
+) -> None:
+    time = [tick.index * dt for tick in ticks]
     axes.plot(time, [np.nan if value is None else value for value in values], color=style)
     axes.margins(x=0.01, y=0.25)
     _mark_events(axes, ticks, time)
@@ -225,19 +234,19 @@ def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
         )
 
 
-def write_videos(ticks: Sequence[Tick], paths: Sequence[Path]) -> None:
+def write_videos(ticks: Sequence[Tick], paths: Sequence[Path], robot: RobotSpec = G1) -> None:
     """Draw ``ticks`` (in order, without gaps) into each path, a ``.gif`` or ``.mp4``.
 
     Raises:
         EnvironmentFailure: the package that encodes this format is not installed.
     """
-    images = list(video_frames(ticks))
+    images, dt = list(video_frames(ticks, robot)), 1.0 / robot.planner_hz
     for path in paths:
         write = _write_gif if path.suffix == ".gif" else _write_mp4
-        write(images, path)
+        write(images, path, dt)
 
 
-def video_frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
+def video_frames(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Frame]:
     """Every `STRIDE`-th tick as an RGB image (H, W, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -247,7 +256,7 @@ def video_frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     scene = figure.add_axes((0.0, 0.0, 0.66, 0.93), **AXES_OPTIONS)
-    titles = ("depth image", f"imagined {AHEAD * PLANNER_DT:.2f} s before")
+    titles = ("depth image", f"imagined {AHEAD / robot.planner_hz:.2f} s before")
     images = [figure.add_axes((0.68, 0.52 - 0.5 * row, 0.3, 0.4)) for row in range(len(titles))]
     for axes, title in zip(images, titles, strict=True):
         axes.set_title(title, fontsize=8)
@@ -256,15 +265,15 @@ def video_frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
         # Axes are slow to make: only what they show is replaced.
         for artist in (*scene.collections, *(image for axes in images for image in axes.images)):
             artist.remove()
-        draw_scene(scene, ticks[i], meshes)
-        draw_depth(images[0], ticks[i].depth / 1000.0)
-        draw_depth(images[1], imagined_of(ticks, i))
-        clock.set_text(f"{ticks[i].index * PLANNER_DT:.2f} s")
+        draw_scene(scene, ticks[i], meshes, robot)
+        draw_depth(images[0], ticks[i].depth / 1000.0, robot)
+        draw_depth(images[1], imagined_of(ticks, i), robot)
+        clock.set_text(f"{ticks[i].index / robot.planner_hz:.2f} s")
         canvas.draw()  # type: ignore[no-untyped-call]
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
-def _write_gif(images: Sequence[Frame], path: Path) -> None:
+def _write_gif(images: Sequence[Frame], path: Path, dt: float) -> None:
     from PIL import Image
 
     # One palette, of frames from the whole video: smaller files, and no flicker.
@@ -274,15 +283,15 @@ def _write_gif(images: Sequence[Frame], path: Path) -> None:
         Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
         for image in images
     ]
-    milliseconds = round(1000 * STRIDE * PLANNER_DT)
+    milliseconds = round(1000 * STRIDE * dt)
     first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
 
 
-def _write_mp4(images: Sequence[Frame], path: Path) -> None:
+def _write_mp4(images: Sequence[Frame], path: Path, dt: float) -> None:
     require_packages("egovcp", "an MP4 video", "av")
     import av
 
-    rate = Fraction(1 / (STRIDE * PLANNER_DT)).limit_denominator(100)
+    rate = Fraction(1 / (STRIDE * dt)).limit_denominator(100)
     with av.open(str(path), "w") as container:
         stream: Any = container.add_stream("libx264", rate=rate, options={"crf": "23"})
         stream.width, stream.height = SIZE

@@ -18,14 +18,22 @@ import rerun.blueprint as rrb
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
-from egovcp.log.blueprint import blueprint, signals_blueprint
+from egovcp.log.blueprint import blueprint, robot_blueprint, signals_blueprint
 from egovcp.log.meshes import LEFT, OBSTACLE, RIGHT, SPHERE, LinkMesh, link_meshes
 from egovcp.log.pose import robot_poses
-from egovcp.log.rerun_columns import Frame, all_columns, log_value_map_styles, skeleton_columns
+from egovcp.log.rerun_columns import (
+    Columns,
+    Frame,
+    all_columns,
+    log_value_map_styles,
+    plain_columns,
+    skeleton_columns,
+)
 from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
 from egovcp.log.tick import CameraView, RunInfo, SceneObject, Tick
 from egovcp.log.viewer import Viewer
-from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
+from egovcp.robot_spec import G1, RobotSpec
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS
 
 BATCH_TICKS: Final = 25  # one second
 LIVE_BATCH_TICKS: Final = 3  # for a low delay
@@ -67,10 +75,12 @@ class RerunSink:
 
     def open(self, info: RunInfo) -> None:
         """Start the recording and log static data."""
-        self._view = info.camera
+        self._view, self._robot = info.camera, info.robot
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
         layout = signals_blueprint() if self._signals else blueprint()
+        if not info.robot.is_g1:
+            layout = robot_blueprint(info.robot)
         if isinstance(self._destination, Viewer):
             self._destination.attach(stream, layout)
         else:
@@ -78,6 +88,9 @@ class RerunSink:
         stream.send_recording_name(name)
         self._stream = stream
         _log_static(stream, info)
+        if not info.robot.is_g1:
+            log_styles(stream, info.robot)
+            return
         if self._signals:
             log_styles(stream)
         else:
@@ -121,9 +134,18 @@ class RerunSink:
 
     def _send(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"
+        self._log_new_objects()
+        for path, ticks, columns in self._columns():
+            if ticks:
+                self._stream.send_columns(path, _times(ticks), columns)
+        self._batch.clear()
+
+    def _columns(self) -> list[Columns]:
+        """All columns of the batch."""
+        if not self._robot.is_g1:
+            return [*plain_columns(self._batch), *signal_columns(self._batch, self._robot)]
         poses = robot_poses(self._batch)
         frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
-        self._log_new_objects()
         groups = [*all_columns(frames, self._view)]
         if not self._meshes:
             groups.append(skeleton_columns(frames))
@@ -131,10 +153,7 @@ class RerunSink:
             groups += signal_columns(self._batch)
         else:
             groups += motor_columns(self._batch, self._faulty_joints)
-        for path, ticks, columns in groups:
-            if ticks:
-                self._stream.send_columns(path, _times(ticks), columns)
-        self._batch.clear()
+        return groups
 
     def _log_new_objects(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"
@@ -173,16 +192,19 @@ def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
 
 def _log_static(stream: rr.RecordingStream, info: RunInfo) -> None:
     stream.log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log(paths.CAMERA, _pinhole(info.camera), static=True)
+    if info.robot.is_g1:
+        stream.log(paths.CAMERA, _pinhole(info.camera), static=True)
     imagined = [f"{paths.IMAGINED}/{i}" for i in range(len(paths.IMAGINED_TICKS))]
     for path in (paths.DEPTH, paths.RECONSTRUCTED, *imagined):
-        stream.log(path, depth_style(), static=True)
+        stream.log(path, depth_style(info.robot), static=True)
     hands = rr.Points3D.from_fields(colors=[LEFT, RIGHT], radii=[0.03], show_labels=False)
     stream.log(paths.HAND_TARGETS, hands, static=True)
     stream.log(paths.CANDIDATES, rr.LineStrips3D.from_fields(radii=[0.003]), static=True)
     best = rr.LineStrips3D.from_fields(colors=[LEFT, RIGHT], radii=[0.008])
     stream.log(paths.BEST, best, static=True)
-    text = json.dumps(asdict(info), indent=2, sort_keys=True)
+    record = asdict(info)
+    record["robot"] = info.robot.robot_type
+    text = json.dumps(record, indent=2, sort_keys=True)
     document = rr.TextDocument(f"```json\n{text}\n```", media_type="text/markdown")
     stream.log(paths.INFO, document, static=True)
 
@@ -198,16 +220,17 @@ def _pinhole(view: CameraView) -> rr.Pinhole:
     )
 
 
-def depth_style() -> rr.DepthImage:
+def depth_style(robot: RobotSpec = G1) -> rr.DepthImage:
     """Format and colour scale of all depth images."""
+    rows, cols = robot.depth
     return rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(
-            width=DEPTH_COLS,
-            height=DEPTH_ROWS,
+            width=cols,
+            height=rows,
             channel_datatype=rr.ChannelDatatype.U16,
             color_model=rr.ColorModel.L,
         ),
         meter=1000.0,
         colormap=rr.components.Colormap.Turbo,
-        depth_range=[0.0, DEPTH_MAX_M * 1000.0],
+        depth_range=[0.0, robot.depth_max_m * 1000.0],
     )

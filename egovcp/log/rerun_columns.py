@@ -54,6 +54,14 @@ def all_columns(frames: Sequence[Frame], view: CameraView) -> Iterator[Columns]:
     yield from _value_maps(ticks)
 
 
+def plain_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
+    """The same for a robot of another kind than the G1, whose links are not known."""
+    yield from _depths(ticks)
+    yield from _scene(ticks)
+    yield from _scalars(ticks)
+    yield from _events(ticks)
+
+
 def _poses(positions: Array, quaternions_wxyz: Array) -> Iterable[Any]:
     """(n, 3) and (n, 4): Rerun orders quaternions x, y, z, w."""
     return rr.Transform3D.columns(

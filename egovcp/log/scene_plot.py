@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from egovcp.log.pose import RobotPose, robot_pose
 from egovcp.log.tick import SceneObject, Tick
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import LINK_NAMES
+from egovcp.robot_spec import G1, RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -24,12 +25,27 @@ _AZIMUTH: Final = 64.0
 _LIGHT: Final = {"azdeg": 38.0, "altdeg": 55.0}
 _STUMBLE_M: Final = 0.3  # distance from the origin beyond which the view follows the robot
 _OBSTACLE_OPACITY: Final = 0.45
+_SMALL_SCENE_M: Final = 0.5  # extent of what is shown of another robot than the G1
 
 
-def draw_scene(axes: Any, tick: Tick, meshes: Mapping[str, LinkMesh]) -> None:
-    """Draw ground, robot and objects of a tick on 3D ``axes`` (see `AXES_OPTIONS`)."""
-    from matplotlib.colors import LightSource
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+def draw_scene(
+    axes: Any, tick: Tick, meshes: Mapping[str, LinkMesh], robot: RobotSpec = G1
+) -> None:
+    """Draw ground, robot and objects of a tick on 3D ``axes`` (see `AXES_OPTIONS`).
+
+    Of another robot than the G1 only the scene is drawn, which may hold its links.
+    """
+    axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
+    axes.set_axis_off()
+    if not robot.is_g1:
+        points = np.array([thing.position_w for thing in tick.scene] or [(0.0, 0.0, 0.0)])
+        half = _SMALL_SCENE_M
+        axes.set(xlim=(-half, 2 * half), ylim=(-1.5 * half, 1.5 * half))
+        axes.set_zlim(0.0, max(half, float(points[:, 2].max())))
+        axes.set_aspect("equal")
+        _draw_faces(axes, [*scene_faces(tick.scene)])
+        return
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     pose = robot_pose(tick)
     x, y = view_offset(pose.positions_w[0])
@@ -37,11 +53,15 @@ def draw_scene(axes: Any, tick: Tick, meshes: Mapping[str, LinkMesh]) -> None:
     axes.set(xlim=(x - _HALF_WIDTH, x + _HALF_WIDTH), ylim=(y - _HALF_WIDTH, y + _HALF_WIDTH))
     axes.set_zlim(0.0, _HEIGHT)
     axes.set_box_aspect((2 * _HALF_WIDTH, 2 * _HALF_WIDTH, _HEIGHT), zoom=1.7)
-    axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
-    axes.set_axis_off()
     ground = Line3DCollection(_ground(pose.positions_w[0]), colors="0.85", linewidths=0.6, zorder=0)
     axes.add_collection3d(ground)
-    faces = [*_robot(pose, meshes), *scene_faces(tick.scene)]
+    _draw_faces(axes, [*_robot(pose, meshes), *scene_faces(tick.scene)])
+
+
+def _draw_faces(axes: Any, faces: Sequence[tuple[Array, Array]]) -> None:
+    from matplotlib.colors import LightSource
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
     if faces:
         seen = [_faces_viewer(corners) for corners, _ in faces]
         polygons = [p for (corners, _), k in zip(faces, seen, strict=True) for p in corners[k]]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from egovcp.log import paths
 from egovcp.log.rerun_columns import Columns, named_columns
 from egovcp.log.tick import MODES, Tick
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.spec import ACTION_BOX, ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 _LEG_JOINTS: Final = ("hip", "knee", "ankle")
@@ -85,14 +86,28 @@ def _outcomes() -> Iterator[Signal]:
 SIGNALS: Final = (*_actions(), *_states(), *_outcomes())
 
 
-def log_styles(stream: rr.RecordingStream) -> None:
+def signals_of(robot: RobotSpec) -> tuple[Signal, ...]:
+    """The signals of a robot: of another one than the G1 its actions and groups of states."""
+    if robot.is_g1:
+        return SIGNALS
+    action = Signal(f"{paths.ACTION}/normalised", robot.action_names, lambda tick: tick.action_sent)
+    return (action, *(_group(robot, name) for name in robot.state_slices), *_outcomes())
+
+
+def _group(robot: RobotSpec, name: str) -> Signal:
+    part = robot.state_slices[name]
+    names = tuple(text.removeprefix(f"{name}.") for text in robot.state_names[part])
+    return Signal(f"{paths.STATE}/{name}", names, lambda tick: tick.state[part])
+
+
+def log_styles(stream: rr.RecordingStream, robot: RobotSpec = G1) -> None:
     """Log the names of the lines of every signal, once per recording."""
-    for signal in SIGNALS:
+    for signal in signals_of(robot):
         stream.log(signal.path, rr.SeriesLines(names=list(signal.names)), static=True)
 
 
-def signal_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
-    for signal in SIGNALS:
+def signal_columns(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Columns]:
+    for signal in signals_of(robot):
         values = np.array([signal.values(tick) for tick in ticks], np.float64)  # (n, lines)
         columns = rr.Scalars.columns(scalars=values.ravel())
         yield Columns(signal.path, ticks, columns.partition([len(signal.names)] * len(ticks)))

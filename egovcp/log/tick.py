@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.geometry import focal_length
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, FEATURES, PLANNER_HZ, SPEC_VERSION
+from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, SPEC_VERSION
 
 Array = NDArray[np.floating]
 
@@ -190,10 +191,15 @@ class RunInfo:
     """Distribution name -> version."""
     backend: str = ""
     """Planner backend, such as int8 or float32; empty: none, or unknown."""
+    robot: RobotSpec = G1
+    """The robot; `Tick` describes shapes of the G1."""
 
     def to_metadata(self) -> dict[str, str]:
         """Strings for an MCAP metadata record; structured values are JSON."""
-        record = asdict(self) | {"features": FEATURES, "spec_version": SPEC_VERSION}
+        record = asdict(self) | {"features": self.robot.features, "spec_version": SPEC_VERSION}
+        record.pop("robot")
+        if not self.robot.is_g1:
+            record[ROBOT_KEY] = self.robot.to_json()
         return {
             key: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
             for key, value in record.items()
@@ -213,4 +219,5 @@ class RunInfo:
             hashes=json.loads(record["hashes"]),
             versions=json.loads(record["versions"]),
             backend=record.get("backend", ""),  # absent in older recordings
+            robot=RobotSpec.from_json(json.loads(record[ROBOT_KEY])) if ROBOT_KEY in record else G1,
         )

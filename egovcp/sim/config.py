@@ -155,7 +155,7 @@ class BaseEnvConfig:
 
 
 if TYPE_CHECKING:
-    from egovcp.sim.tasks.base import Task
+    from egovcp.sim.tasks.base_task import BaseTask
 
     class EnvConfig(BaseEnvConfig):
         """See `_env_config`."""
@@ -173,12 +173,12 @@ else:
         return _env_config(_tasks())
 
 
-def _tasks() -> tuple[type[Task], ...]:
+def _tasks() -> tuple[type[BaseTask], ...]:
     return tuple(entry.task for entry in task_entries() if entry.task is not None)
 
 
 @cache
-def _env_config(tasks: tuple[type[Task], ...]) -> type[BaseEnvConfig]:
+def _env_config(tasks: tuple[type[BaseTask], ...]) -> type[BaseEnvConfig]:
     """`BaseEnvConfig` with the options ``<task>`` and ``<task>_episode`` of every task."""
     options = []
     for task in tasks:
@@ -197,7 +197,7 @@ def _env_config(tasks: tuple[type[Task], ...]) -> type[BaseEnvConfig]:
     )
 
 
-def with_episodes(change: Callable[[type[Task], EpisodeConfig], EpisodeConfig]) -> EnvConfig:
+def with_episodes(change: Callable[[type[BaseTask], EpisodeConfig], EpisodeConfig]) -> EnvConfig:
     """The default environment, with the episodes of each task changed."""
     tasks = _tasks()
     config: Any = _env_config(tasks)()

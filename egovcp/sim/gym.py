@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -11,26 +11,18 @@ from numpy.typing import NDArray
 from egovcp.robot.controllers import LowLevelController
 from egovcp.sim import config as sim_config
 from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks.registry import task_names
-from egovcp.spec import (
-    ACTION_DIM,
-    DEPTH_COLS,
-    DEPTH_MAX_M,
-    DEPTH_ROWS,
-    PLANNER_HZ,
-    STATE_DIM,
-)
+from egovcp.sim.tasks.registry import find_task, task_names
 
 GymObservation = dict[str, NDArray[Any]]
-
-_MAX_MM: Final = round(DEPTH_MAX_M * 1000)
 
 
 class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
     """One robot in one task, 25 Hz.
 
-    Observation: ``depth`` (H, W) uint16 mm, 0 invalid, and ``state`` (S,) float32. Action:
+    Shapes are those of the robot of the task, here the G1's. Observation: ``depth`` (H, W) uint16
+    mm, 0 invalid, and ``state`` (S,) float32. Action:
     (7,) in [-1, 1]. ``info`` holds ``success``, ``sent_action`` and ``reward_terms``.
     ``reset(seed=n)`` starts episode 0 of seed n, ``reset()`` the next episode of the seed.
     """
@@ -45,16 +37,21 @@ class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
         controller: LowLevelController | None = None,
         seed: int = 0,
     ) -> None:
-        self.metadata = {"render_modes": [], "render_fps": PLANNER_HZ}
         self._next = Scenario(task, seed, 0)
-        self._env = VectorEnv(config or sim_config.EnvConfig(), 1, controller)
+        options = config or sim_config.EnvConfig()
+        robot = find_task(task).robot_spec()
+        self.metadata = {"render_modes": [], "render_fps": robot.planner_hz}
+        self._env = (
+            VectorEnv(options, 1, controller) if robot.is_g1 else make_env(options, 1, [task])
+        )
+        most = round(1000 * robot.depth_max_m)
         self.observation_space = gymnasium.spaces.Dict(
             {
-                "depth": gymnasium.spaces.Box(0, _MAX_MM, (DEPTH_ROWS, DEPTH_COLS), np.uint16),
-                "state": gymnasium.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+                "depth": gymnasium.spaces.Box(0, most, robot.depth, np.uint16),
+                "state": gymnasium.spaces.Box(-np.inf, np.inf, (robot.state_dim,), np.float32),
             }
         )
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (robot.action_dim,), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

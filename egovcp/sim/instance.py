@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 import numpy as np
@@ -34,6 +34,7 @@ from egovcp.spec import (
 
 if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
+    from egovcp.sim.tasks.base import Task
 
 Array = NDArray[np.float64]
 
@@ -152,7 +153,8 @@ class EnvInstance:
         self._draw_sensors()
         self.physics = sample_physics(self._config.randomise, scenario)
         apply_physics(self.physics, self.robot.scene, self.robot.model)
-        self.task = find_task(scenario.task)(self._config, scenario, self.robot)
+        task: Any = find_task(scenario.task)(self._config, scenario, self.robot)
+        self.task: Task = task
         self._task_parameters = self.task.parameters
         self._caster = RayCaster(self.robot.model, self.robot.index.torso_body)
         offset = initial_offset(self._config.randomise, scenario)
@@ -199,6 +201,24 @@ class EnvInstance:
             "image_age_ticks": self.image_age,
             "camera_pitch": self.camera_pitch,
         }
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What datasets record of the scenario."""
+        return {
+            "event_tick": self.task.event_tick,
+            "action_delay": self.action_delay,
+            "image_age": self.image_age,
+            "camera_pitch": self.camera_pitch,
+            "physics": asdict(self.physics),
+            "scene": self.task.parameters,
+        }
+
+    @property
+    def base_pose(self) -> Array:
+        """(7,) pose of the pelvis in the world, m and quaternion wxyz."""
+        pose: Array = self.robot.data.qpos[:7].copy()
+        return pose
 
     @property
     def done(self) -> bool:

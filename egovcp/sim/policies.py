@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.env import VectorEnv
+from egovcp.sim.env import BaseVectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task
 from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 class EnvPolicy(Protocol):
     """Acts on all rows of an environment."""
 
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
         """Each row starts one of ``scenarios``."""
         ...
 
@@ -32,15 +32,15 @@ class EnvPolicy(Protocol):
         """``rows`` start ``scenarios``."""
         ...
 
-    def act(self, env: VectorEnv) -> Array:
-        """(B, 7) normalised actions for this planner tick."""
+    def act(self, env: BaseVectorEnv) -> Array:
+        """(B, A) normalised actions for this planner tick."""
         ...
 
 
 class _Stateless:
     """A policy without memory."""
 
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
         """See `EnvPolicy`."""
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
@@ -50,20 +50,22 @@ class _Stateless:
 class Constant(_Stateless):
     """The same action always."""
 
-    def __init__(self, action: Sequence[float] | NDArray[np.floating]) -> None:
+    def __init__(
+        self, action: Sequence[float] | NDArray[np.floating], size: int = ACTION_DIM
+    ) -> None:
         self._action = np.asarray(action, dtype=np.float64)
-        if self._action.shape != (ACTION_DIM,):
-            raise UsageError(f"expected {ACTION_DIM} numbers, found shape {self._action.shape}")
+        if self._action.shape != (size,):
+            raise UsageError(f"expected {size} numbers, found shape {self._action.shape}")
 
-    def act(self, env: VectorEnv) -> Array:
+    def act(self, env: BaseVectorEnv) -> Array:
         return np.tile(self._action, (env.num_envs, 1))
 
 
-class Hold(Constant):
+class Hold(_Stateless):
     """The neutral pose."""
 
-    def __init__(self) -> None:
-        super().__init__(np.zeros(ACTION_DIM))
+    def act(self, env: BaseVectorEnv) -> Array:
+        return np.zeros((env.num_envs, env.robot.action_dim))
 
 
 class RandomWalk:
@@ -88,13 +90,13 @@ class RandomWalk:
         self._eta = eta
         self._bounds = bounds
         self._step_ticks = step_ticks
-        self._action = np.zeros((0, ACTION_DIM))
+        self._action: Array = np.zeros((0, ACTION_DIM))
         self._wait = np.zeros(0, dtype=np.int64)  # ticks until the next step
         self._rngs: list[np.random.Generator] = []
 
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
         """See `EnvPolicy`; rows start from neutral."""
-        self._action = np.zeros((len(scenarios), ACTION_DIM))
+        self._action = np.zeros((len(scenarios), env.robot.action_dim))
         self._wait = np.zeros(len(scenarios), dtype=np.int64)
         self._rngs = [scenario.rng("policy") for scenario in scenarios]
 
@@ -110,7 +112,7 @@ class RandomWalk:
 
         The row's further steps are sampled from its generator in ``rngs``.
         """
-        self._action = np.zeros((len(action), ACTION_DIM))
+        self._action = np.zeros_like(action, np.float64)
         self._wait = np.zeros(len(action), dtype=np.int64)
         self._rngs = list(rngs)
         self.start_rows_at(range(len(action)), action)
@@ -127,7 +129,7 @@ class RandomWalk:
         waits = np.arange(least, most + 1)
         return int(rng.integers(rng.choice(waits, p=waits / waits.sum())))
 
-    def act(self, env: VectorEnv) -> Array:
+    def act(self, env: BaseVectorEnv) -> Array:
         delta = np.array([self._delta(row) for row in range(len(self._rngs))])
         action = self._action + self._eta * delta
         reflects = self._bounds == "reflect"
@@ -135,14 +137,14 @@ class RandomWalk:
         return self._action.copy()
 
     def _delta(self, row: int) -> Array:
-        """(7,) the change of a row's action; zeros between two steps."""
+        """(A,) the change of a row's action; zeros between two steps."""
         if self._wait[row] > 0:
             self._wait[row] -= 1
-            return np.zeros(ACTION_DIM)
+            return np.zeros(self._action.shape[1])
         rng, (least, most) = self._rngs[row], self._step_ticks
         if most > 1:  # else nothing is sampled, as in the paper's walk
             self._wait[row] = rng.integers(least, most, endpoint=True) - 1
-        return rng.uniform(-1.0, 1.0, ACTION_DIM)
+        return rng.uniform(-1.0, 1.0, self._action.shape[1])
 
 
 class Oracle(_Stateless):
@@ -152,10 +154,10 @@ class Oracle(_Stateless):
         UsageError: a task has none.
     """
 
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
         for task in dict.fromkeys(scenario.task for scenario in scenarios):
             if not find_task(task).has_oracle():
                 raise UsageError(f"task {task} has no oracle; choose another controller")
 
-    def act(self, env: VectorEnv) -> Array:
+    def act(self, env: BaseVectorEnv) -> Array:
         return np.array([instance.task.oracle() for instance in env.instances])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from egovcp.log.tick import CameraView, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
+from egovcp.robot_spec import RobotSpec
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
 from egovcp_deploy.pilot.pilot import HOLD_RATE
@@ -70,6 +71,10 @@ class Disturbed:
     @property
     def camera(self) -> CameraView:
         return self._robot.camera
+
+    @property
+    def spec(self) -> RobotSpec:
+        return self._robot.spec
 
     def start(self, episode: int) -> None:
         self.tick, self.damped_at = 0, -1

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from egovcp.log.tick import CameraView
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
+from egovcp.robot_spec import G1
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.pilot.planner import LOGGED_CANDIDATES, InlinePlanner, PlannerRunner
@@ -68,6 +69,7 @@ class FakePolicy(PlainPolicy):
 class FakeRobot:
     """Its image counts the ticks; it halves every action, so that sent and planned ones differ."""
 
+    spec = G1
     controller_id = "fake"
     camera = CameraView()
 

@@ -17,7 +17,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.plan.policy import Policy
 
 if TYPE_CHECKING:
-    from egovcp.sim.env import VectorEnv
+    from egovcp.sim.env import BaseVectorEnv
     from egovcp.sim.scenario import Scenario
 
 VALIDATION: Final = 3_000_000_000  # scenarios of neither a collection nor of egovcp-eval
@@ -46,7 +46,7 @@ class ClosedLoop:
         Raises:
             UsageError: the controller is not one of those that egovcp ships.
         """
-        self._controller = _named(controller_id)
+        self._controller = _named(controller_id, tasks)
         self._tasks, self._episodes, self._seed = tuple(tasks), episodes, seed
 
     def play(self, model: WorldModel, planner: PlannerConfig) -> dict[str, float]:
@@ -66,14 +66,14 @@ class ClosedLoop:
         self, model: WorldModel, planner: PlannerConfig, scenarios: Sequence[Scenario]
     ) -> Played:
         from egovcp.sim.config import evaluation_config
-        from egovcp.sim.env import VectorEnv
+        from egovcp.sim.robot_env import make_env
 
         config = replace(evaluation_config(), controller=self._controller)
-        env = VectorEnv(config, len(scenarios))
+        env = make_env(config, len(scenarios), [scenario.task for scenario in scenarios])
         return _play(env, Policy(model, planner, len(scenarios), self._seed), scenarios)
 
 
-def _play(env: VectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Played:
+def _play(env: BaseVectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Played:
     """Return and success (B,) each of one episode per row."""
     observation = env.reset(scenarios)
     returns = np.zeros(len(scenarios))
@@ -87,10 +87,13 @@ def _play(env: VectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Play
     return returns, success
 
 
-def _named(controller_id: str) -> str:
-    """The name of the shipped controller with this id."""
+def _named(controller_id: str, tasks: Sequence[str]) -> str:
+    """The name of the shipped controller of the G1 with this id; another robot has its own."""
     from egovcp.robot.controllers import STANCE, WALK, make_controller
+    from egovcp.sim.env import one_robot
 
+    if not one_robot(tasks).is_g1:
+        return WALK
     ids = {make_controller(name).id: name for name in (STANCE, WALK)}
     if controller_id not in ids:
         raise UsageError(

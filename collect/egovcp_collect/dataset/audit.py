@@ -16,7 +16,7 @@ from egovcp.data.provenance import source_index, source_provenances
 from egovcp.data.source import select_episodes
 from egovcp.errors import DataError
 from egovcp.outputs import output_file, write_report
-from egovcp.robot.controllers import make_controller
+from egovcp.sim.robot_env import controller_id_of
 from egovcp.sim.scenario import Scenario
 from egovcp.terminal import echo
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
@@ -141,7 +141,7 @@ def _recorded_config(reader: DatasetReader, index: int) -> CollectConfig:
         reason = " ".join(str(error).split())
         problem = f"its configuration is not one of this version of egovcp: {reason}"
         raise _error(reader, index, problem) from error
-    controller = make_controller(config.env.controller).id
+    controller = controller_id_of(config.env, config.tasks)
     if controller != reader.controller_id:
         problem = f"controller {reader.controller_id}, but here it is {controller}"
         raise _error(reader, index, problem)

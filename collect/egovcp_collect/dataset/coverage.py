@@ -81,6 +81,9 @@ def run_coverage(config: CoverageConfig) -> None:
         write_report(config.json, report_features(LeRobotReader.open(root)))
         return
     reader = DatasetReader.open(config.dataset)
+    if not reader.robot.is_g1:
+        write_report(config.json, report_features(LeRobotReader.open(root)))
+        return
     statistics = compute_statistics(reader, config.returns)
     checks = assess(statistics)
     echo(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} steps\n")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import DatasetReader, ReturnConfig
+from egovcp.errors import UsageError
 from egovcp.spec import ACTION_BOX, ACTION_NAMES
 from egovcp_collect.dataset.task_data import (
     DepthStatistics,
@@ -157,7 +158,13 @@ def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetS
 
     Raises:
         DataError: a file is damaged.
+        UsageError: the dataset is of another robot than the G1.
     """
+    if not reader.robot.is_g1:
+        raise UsageError(
+            f"{reader.root} is of robot {reader.robot.robot_type}: statistics of hands, and cards "
+            "with them, are those of the G1; use `egovcp-dataset info` and `check`"
+        )
     rows = read_rows(reader, returns)
     samples = [sample_episodes(reader, task) for task in rows]
     steps = reader.num_frames

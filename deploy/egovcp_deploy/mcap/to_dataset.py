@@ -195,7 +195,7 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
         ticks = _until_end(_planned(raw.tick(ROW_TOPICS) for raw in raw_ticks))
         deque(raw_ticks, maxlen=0)  # read on to the end: damage may follow the episode
         reader.require_undamaged()
-        kept, gap = _before_gap(ticks)
+        kept, gap = _before_gap(ticks, reader.info.fps)
         if gap and gaps == "refuse":
             raise DataError(
                 f"{gap}; rows of an episode are one period apart. --gaps=cut keeps what comes "
@@ -233,7 +233,7 @@ def _until_end(ticks: Iterator[Tick]) -> list[Tick]:
     return kept
 
 
-def _before_gap(ticks: Sequence[Tick]) -> tuple[list[Tick], str]:
+def _before_gap(ticks: Sequence[Tick], fps: int) -> tuple[list[Tick], str]:
     """The ticks before the first gap, and where that is; empty if there is none."""
     from egovcp.rollouts import follows
 
@@ -244,7 +244,7 @@ def _before_gap(ticks: Sequence[Tick]) -> tuple[list[Tick], str]:
             return [], "its first ticks are missing"
     for i in range(1, len(ticks)):
         before, tick = ticks[i - 1], ticks[i]
-        if not follows(before, tick):
+        if not follows(before, tick, fps):
             count = tick.index - before.index - 1
             what = f"{count} ticks are missing" if count else "the robot paused"
             return list(ticks[:i]), f"{what} after tick {before.index}"

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.stance import pelvis_height
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT, COMMAND_SLICE, STATE_SLICES
 from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage, PlannerClient
 from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State, Supervisor
@@ -73,8 +74,8 @@ class SafetyFilter:
     action, and after `PATIENCE_TICKS` rejections in a row it eases to the neutral pose.
     """
 
-    def __init__(self, rows: int = 1) -> None:
-        self._last: Array = np.zeros((rows, ACTION_DIM))
+    def __init__(self, rows: int = 1, actions: int = ACTION_DIM) -> None:
+        self._last: Array = np.zeros((rows, actions))
         self._rejections: NDArray[np.int64] = np.zeros(rows, np.int64)
 
     def filter(self, planned: NDArray[np.floating]) -> Array:
@@ -114,10 +115,12 @@ class Freshness:
 
     A driver that has died behind a live connection repeats its last reading with new time stamps.
     Real sensors are noisy: a reading that repeats bit for bit is not new. Depth images without a
-    valid pixel are the exception: with nothing in range all of them are equal.
+    valid pixel are the exception: with nothing in range all of them are equal. So are simulated
+    sensors without noise, if ``repeats``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, repeats: bool = False) -> None:
+        self._repeats = repeats
         self._content: bytes | None = None
         self._time_ns: int | None = None
         self._changed_ns: int | None = None
@@ -127,7 +130,11 @@ class Freshness:
         if content is None or not np.isfinite(content).all():
             return
         raw = content.tobytes()
-        if raw != self._content or (time_ns != self._time_ns and not content.any()):
+        if (
+            self._repeats
+            or raw != self._content
+            or (time_ns != self._time_ns and not content.any())
+        ):
             self._content, self._changed_ns = raw, time_ns
         self._time_ns = time_ns
 
@@ -149,18 +156,25 @@ def posture(state: NDArray[np.floating]) -> tuple[float, float]:
 
 class Pilot:
     """Connects one robot with its planner, for one run. ``limits`` and the initial ``state`` are
-    those of its `Supervisor`."""
+    those of its `Supervisor`. A ``robot`` of another kind than the G1 is a simulated one, whose
+    posture is not supervised."""
 
     def __init__(
-        self, planner: PlannerClient, limits: Limits | None = None, state: State = State.INIT
+        self,
+        planner: PlannerClient,
+        limits: Limits | None = None,
+        state: State = State.INIT,
+        robot: RobotSpec = G1,
     ) -> None:
+        self._robot = robot
         self._planner = planner
         self.supervisor = Supervisor(limits, state)
         self.tick = 0  # the planner tick of the next observation, or of the pending action
-        self.sent: Array = np.zeros(7)  # a_{t-1}, (7,)
-        self._safety = SafetyFilter()
+        self.sent: Array = np.zeros(robot.action_dim)  # a_{t-1}, (7,)
+        self._safety = SafetyFilter(1, robot.action_dim)
         self._plans = PlanBuffer()
-        self._proprioception, self._image = Freshness(), Freshness()
+        repeats = not robot.is_g1
+        self._proprioception, self._image = Freshness(repeats), Freshness(repeats)
         self._tilt, self._height = 0.0, 0.74
         self._unanswered: deque[ObservationMessage] = deque(maxlen=64)
         self._first = True  # the next observation restarts the recurrence
@@ -178,10 +192,12 @@ class Pilot:
     ) -> None:
         """Take the newest readings, None if not available: proprioception (74,), which arrived at
         ``state_ns`` (None: now), and a depth image (48, 64), which arrived at ``depth_ns``."""
-        measured = None if state is None else np.delete(np.asarray(state), COMMAND_SLICE)
+        measured = None if state is None else np.asarray(state)
+        if measured is not None and self._robot.is_g1:
+            measured = np.delete(measured, COMMAND_SLICE)
         self._proprioception.update(now_ns if state_ns is None else state_ns, measured)
         self._image.update(now_ns if depth_ns is None else depth_ns, depth)
-        if measured is not None and np.isfinite(measured).all():
+        if self._robot.is_g1 and measured is not None and np.isfinite(measured).all():
             self._tilt, self._height = posture(np.asarray(state))
 
     def update_state(self, facts: Facts, request: OperatorRequest | None = None) -> State:

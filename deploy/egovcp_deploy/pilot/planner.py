@@ -30,7 +30,8 @@ from egovcp.plan import (
 from egovcp.plan.objective import Dynamics
 from egovcp.plan.value_map import HAND_AXES
 from egovcp.rate import Clock
-from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_HANDS
+from egovcp.robot_spec import G1, RobotSpec
+from egovcp.spec import ACTION_BOX, ACTION_HANDS
 
 SKIPPED: Final = "observation skipped: its state is not finite, or impossible"
 BACKLOG: Final = 8  # observations that wait for a busy planner; older ones are dropped
@@ -248,8 +249,11 @@ class PlannerRunner:
 
     def warm_up(self) -> None:
         """Plan and decode on a blank observation: the first calls compile and allocate."""
-        depth, state = blank_observation(1)
-        blank = ObservationMessage(0, 0, depth[0], state[0], np.zeros(ACTION_DIM), first=True)
+        policy = self._policy
+        robot = policy.model.robot if isinstance(policy, Policy) else G1
+        depth, state = blank_observation(1, robot)
+        sent = np.zeros(robot.action_dim)
+        blank = ObservationMessage(0, 0, depth[0], state[0], sent, first=True)
         for _ in range(2):
             self.decode(self.plan([blank]))
         self._next_tick = None
@@ -259,7 +263,8 @@ class PlannerRunner:
         if self._imagining is None:
             return plan
         maps: tuple[ValueMap, ...] = ()
-        if isinstance(policy := self._policy, Policy):
+        policy = self._policy
+        if isinstance(policy, Policy) and policy.model.robot.is_g1:  # of its hands
             maps = value_maps(policy.model, policy.carry, plan.step.action[0])
         return replace(
             plan,
@@ -321,8 +326,9 @@ class InlinePlanner:
             self._ready = (now_ns + self._delay_ns(plan.tick), plan)
 
 
-def planner_fields(plan: PlanMessage | None) -> dict[str, Any]:
-    """The fields of `Tick` that come from the planner; unknown ones are left out."""
+def planner_fields(plan: PlanMessage | None, robot: RobotSpec = G1) -> dict[str, Any]:
+    """The fields of `Tick` that come from the planner; unknown ones are left out. Candidates are
+    the paths of the hands of a G1."""
     if plan is None:
         return {}
     step = plan.step
@@ -331,7 +337,7 @@ def planner_fields(plan: PlanMessage | None) -> dict[str, Any]:
         "depth_imagined": plan.imagined,
         "value_maps": plan.value_maps,
         "plan": step.plan[0] if step.plan.size else None,
-        "candidates": _candidates(step) if step.candidates.size else None,
+        "candidates": _candidates(step) if step.candidates.size and robot.is_g1 else None,
         "value": float(step.value[0]) if step.value.size else None,
         "termination": float(step.termination[0]) if step.termination.size else None,
     }

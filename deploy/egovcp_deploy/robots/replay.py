@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from egovcp.errors import DataError, UsageError
 from egovcp.log.mcap_reader import Recording, read_recording
 from egovcp.log.tick import CameraView
+from egovcp.robot_spec import RobotSpec
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
@@ -47,6 +48,11 @@ class ReplayRobot:
     def controller_id(self) -> str:
         """Low-level controller of the recorded robot."""
         return self._recording.info.hashes.get("low_level_controller", "")
+
+    @property
+    def spec(self) -> RobotSpec:
+        """The kind of robot."""
+        return self._recording.info.robot
 
     @property
     def camera(self) -> CameraView:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import BasePose, CameraView, SceneObject
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import Observation, PrivilegedState, VectorEnv
+from egovcp.sim.env import BaseVectorEnv, Observation
+from egovcp.sim.robot_env import make_env
 from egovcp.sim.tasks.base import Solid
 from egovcp.sim.tasks.registry import find_task
 from egovcp.spec import ACTION_TERMS
@@ -29,7 +30,9 @@ class SimRobot:
     """Robot in lock-step whose rollout i is held-out scenario i of ``task`` and ``seed``."""
 
     def __init__(self, config: EnvConfig, task: str, seed: int) -> None:
-        self._env = VectorEnv(config, num_envs=1)
+        self._env = make_env(config, 1, [task])
+        self.spec = self._env.robot
+        """The kind of robot."""
         self._fov = config.camera.vertical_fov
         self._mount = config.camera.position
         self._task = task
@@ -40,16 +43,19 @@ class SimRobot:
     @property
     def controller_id(self) -> str:
         """Identity of the simulated robot's low-level controller."""
-        return self._env.controller.id
+        return self._env.controller_id
 
     @property
     def camera(self) -> CameraView:
-        """The camera with this episode's randomised pitch."""
+        """The camera of the G1 with this episode's randomised pitch; of another robot the default,
+        which is not used."""
+        if not self.spec.is_g1:
+            return CameraView()
         pitch = self._env.instances[0].camera_pitch if self._env.instances else 0.0
         return CameraView("torso_link", self._mount, pitch, self._fov)
 
     @property
-    def env(self) -> VectorEnv:
+    def env(self) -> BaseVectorEnv:
         """The simulator, for scripted policies that use its privileged state."""
         return self._env
 
@@ -62,7 +68,7 @@ class SimRobot:
     def observe(self) -> RobotObservation:
         """Return the observation, with the simulator's poses of pelvis and scene."""
         assert self._observation is not None, "start an episode first"
-        poses = true_poses(self._env.privileged_state(), 0)
+        poses = true_poses(self._env, 0)
         return RobotObservation(self._observation.depth[0], self._observation.state[0], *poses)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
@@ -83,9 +89,8 @@ class SimRobot:
 
     def _events(self, terms: dict[str, float]) -> list[str]:
         """Events that happened for the first time in this episode."""
-        truth = self._env.privileged_state()
-        begun = float(truth.since_event[0]) > 0.0
-        events = [find_task(truth.task[0]).event] if begun else []
+        task = self._env.instances[0].task
+        events = [find_task(task.current_name).event] if task.since_event > 0.0 else []
         counted = [n for n, value in terms.items() if value != 0.0 and n not in ACTION_TERMS]
         events += [_TERM_EVENTS.get(name, name) for name in counted]
         events = [text for text in events if text not in self._logged]
@@ -101,11 +106,11 @@ class SimRobot:
         self._env.close()
 
 
-def true_poses(truth: PrivilegedState, row: int) -> tuple[BasePose, tuple[SceneObject, ...]]:
-    """Poses of pelvis and scene of one robot."""
-    pelvis = truth.pelvis_w[row]
-    scene = tuple(_scene_object(solid) for solid in truth.solids[row])
-    return BasePose(pelvis[:3].copy(), pelvis[3:].copy()), scene
+def true_poses(env: BaseVectorEnv, row: int) -> tuple[BasePose, tuple[SceneObject, ...]]:
+    """Poses of base and scene of one robot."""
+    base = env.instances[row].base_pose
+    scene = tuple(_scene_object(solid) for solid in env.instances[row].task.solids())
+    return BasePose(base[:3].copy(), base[3:].copy()), scene
 
 
 def _scene_object(solid: Solid) -> SceneObject:

@@ -10,8 +10,12 @@ from egovcp.sim.tasks.options import EpisodeConfig, Range, TaskConfig
 from egovcp.sim.tasks.registry import find_task, register_task, task_entries, task_names
 
 if TYPE_CHECKING:
+    from egovcp.robot_spec import Mirror, RobotSpec
+    from egovcp.sim.mujoco_robot import MujocoRobot
     from egovcp.sim.scene import HANDS, HEAD, LEG, PARTS, TORSO, Contact
     from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+    from egovcp.sim.tasks.robot_task import RobotTask
+    from egovcp.spec import ActionBox
 
 __all__ = [
     "HANDS",
@@ -19,11 +23,16 @@ __all__ = [
     "LEG",
     "PARTS",
     "TORSO",
+    "ActionBox",
     "Array",
     "Contact",
     "EpisodeConfig",
+    "Mirror",
+    "MujocoRobot",
     "ObjectState",
     "Range",
+    "RobotSpec",
+    "RobotTask",
     "Solid",
     "Task",
     "TaskConfig",
@@ -38,6 +47,10 @@ __all__ = [
 _MODULES = {
     **dict.fromkeys(("HANDS", "HEAD", "LEG", "PARTS", "TORSO", "Contact"), "egovcp.sim.scene"),
     **dict.fromkeys(("Array", "ObjectState", "Solid", "Task"), "egovcp.sim.tasks.base"),
+    **dict.fromkeys(("Mirror", "RobotSpec"), "egovcp.robot_spec"),
+    "ActionBox": "egovcp.spec",
+    "MujocoRobot": "egovcp.sim.mujoco_robot",
+    "RobotTask": "egovcp.sim.tasks.robot_task",
 }
 
 

@@ -1,69 +1,41 @@
-"""Base class of tasks: scene, event, contacts, named reward terms, success, and an oracle.
+"""Base class of the tasks of the G1: scene, event, contacts, rewards, success, and an oracle.
 
 A task of your own is a subclass of `Task` that an installed package names in the entry-point group
-``egovcp.tasks``, or that a command gets as ``--task=package.module:Class``.
+``egovcp.tasks``, or that a command gets as ``--task=package.module:Class``. Tasks of a robot of
+another kind are subclasses of `egovcp.sim.tasks.RobotTask`.
 """
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar, Final
 
-import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from egovcp.errors import EnvironmentFailure
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.sim.scene import PARTS, Contact
-from egovcp.sim.tasks.options import EpisodeConfig, TaskConfig
+from egovcp.sim.tasks.base_task import Array, BaseTask, ObjectState, Solid
 from egovcp.spec import (
     ACTION_BOX,
-    ACTION_DIM,
-    ACTION_RATE_LIMIT,
     CONTROLLER_TICKS_PER_PLAN,
     PHYSICS_DT,
     PHYSICS_STEPS_PER_CONTROLLER_TICK,
 )
 
 if TYPE_CHECKING:
-    from egovcp.sim.config import BaseEnvConfig, EnvConfig
+    from egovcp.sim.config import EnvConfig
     from egovcp.sim.robot import SimulatedRobot
     from egovcp.sim.scenario import Scenario
 
-Array = NDArray[np.float64]
+__all__ = ["Array", "ObjectState", "Solid", "Task"]
 
 PHYSICS_STEPS_PER_TICK: Final = CONTROLLER_TICKS_PER_PLAN * PHYSICS_STEPS_PER_CONTROLLER_TICK
 FALL_HEIGHT: Final = 0.40  # m, pelvis; the lowest command is 0.52
 FALL_TILT: Final = 1.0  # rad, pelvis; the deepest squat pitches it by 0.5
 
 
-@dataclass(frozen=True)
-class Solid:
-    """An object in the scene, for visualisation."""
-
-    name: str
-    shape: Literal["sphere", "box"]
-    size: tuple[float, float, float]  # Half sizes of a box, or the radius three times, m
-    position_w: Array  # (3,) centre, m
-    quaternion_w: Array  # (4,) wxyz
-
-
-@dataclass(frozen=True)
-class ObjectState:
-    """State of the task's object; quantities that a task lacks are NaN."""
-
-    position_w: Array
-    """(3,) the point that matters, m: such as the centre of a ball or the nearest point of a wall.
-    The world model learns to locate it in the images."""
-    velocity_w: Array  # (3,) m/s
-    size: float  # Such as a radius, m
-    active: bool  # Whether the robot has to act now
-
-
-class Task(ABC):
+class Task(BaseTask):
     """One episode of a task; a subclass defines the task, and `VectorEnv` drives the episode.
 
     Class attributes describe the task, `add_objects` adds its objects to the scene. Per episode:
@@ -72,31 +44,7 @@ class Task(ABC):
     tick of 40 ms: `rewards`. All randomness comes from `sample` and `scenario`.
     """
 
-    name: ClassVar[str]
-    """Name of the task in commands, datasets and options: lower-case letters, digits, ``_``."""
-    description: ClassVar[str]
-    """What the robot has to do, in one line; cards show it."""
-    terms: ClassVar[Mapping[str, str]]
-    """Reward term -> the column of ``spec.REWARD_TERMS`` in which datasets store it: ``block`` (a
-    wanted contact), ``pass`` (another achievement) or ``hit`` (an unwanted contact or state).
-    ``fall`` and ``spec.ACTION_TERMS`` are terms of every task."""
-    config: Any = TaskConfig()
-    """Options of the task, ``--env.<name>.*``: a frozen dataclass derived from `TaskConfig`. The
-    value of the class holds the defaults, that of an instance the options of the environment."""
-    event: ClassVar[str] = "event"
-    """What the event is called in logs, such as ``robot pushed``."""
-    episode: ClassVar[EpisodeConfig | None] = EpisodeConfig()
-    """Default of ``--env.<name>_episode.*``; None: there are no such options."""
-    short_episode: ClassVar[EpisodeConfig | None] = None
-    """Its default in ``egovcp-collect``, where the event comes soon; None: `episode`."""
-    event_ticks: ClassVar[int] = 50
-    """Planner ticks that an event takes; figures show these."""
-    needs_walking: ClassVar[bool] = False
-    """Whether `velocity_command` is not always zero."""
-    in_sequence: ClassVar[Literal["no", "anywhere", "last"]] = "no"
-    """Whether the task can be part of a sequence, which requires `park` and `finished`."""
-    for_training: ClassVar[bool] = True
-    """Whether datasets of the task can be collected; ``--task=all`` has all these tasks."""
+    robot: SimulatedRobot
     constant_poses: ClassVar[tuple[tuple[float, ...], ...]] = (
         (0.2, 0.45, 0.8),
         (0.0, -0.3),
@@ -104,116 +52,40 @@ class Task(ABC):
         (0.0, -0.6),
     )
     """Grid of the search for the best constant action: forward, outward, up, height; box units."""
-    seed_key: ClassVar[int | None] = None
-    """Key of the task's random streams; None: derived from `name`. Only for egovcp's own tasks,
-    which had these keys before."""
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
-        self.config = config.options_of(self.name)
-        self.scenario = scenario
-        self.robot = robot
-        self.parameters: dict[str, float] = {}
-        """Sampled parameters of this episode, SI units."""
-        self._pose_cost, self._action_rate_cost = config.pose_cost, config.action_rate_cost
-        self._last_action: Array = np.zeros(ACTION_DIM)
-        self._counted: set[str] = set()  # terms that occur once and have occurred
-        episode = config.episode(self.name)
-        rng = scenario.rng("event")
-        low, high = episode.event_ticks
-        tick = int(rng.integers(low, high + 1))
-        empty = bool(rng.random() < episode.empty_probability)
-        self.event_tick: int | None = None if empty else tick
-        self.ticks_limit = episode.ticks
-        self.physics_steps = 0
-        self.fallen = False
+        super().__init__(config, scenario, robot)
         self.forces = np.zeros(len(PARTS))  # peak per part in the last tick, N
 
-    # --- the task ------------------------------------------------------------------------
     @classmethod
-    @abstractmethod
-    def add_objects(cls, spec: mujoco.MjSpec) -> None:
-        """Add the task's bodies to the scene, out of sight; called once per process.
+    def robot_spec(cls) -> RobotSpec:
+        """The G1."""
+        return G1
 
-        A geom meets the robot if its ``contype`` is 1. Shapes that vary between episodes are set in
-        ``__init__`` with `SimulatedRobot.shape_geom`.
-        """
+    @classmethod
+    def physics_clock(cls) -> tuple[float, int]:
+        """Duration of a physics step, s, and physics steps per planner tick."""
+        return PHYSICS_DT, PHYSICS_STEPS_PER_TICK
 
-    @abstractmethod
-    def place(self) -> None:
-        """Place the objects for the start of the episode, around the standing robot."""
+    @classmethod
+    def constant_actions(cls) -> list[tuple[float, ...]]:
+        """The poses of `constant_poses`, which are left-right symmetric."""
+        return [
+            (forward, outward, up, forward, 0.0 - outward, up, height)
+            for forward, outward, up, height in itertools.product(*cls.constant_poses)
+        ]
 
-    def before_step(self) -> None:  # noqa: B027 - optional
-        """Move objects or push the robot, before a physics step; by default nothing."""
-
-    def process_contacts(self, contacts: Sequence[Contact]) -> None:  # noqa: B027 - optional
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
         """Process the contacts between robot and objects of a physics step."""
-
-    @abstractmethod
-    def rewards(self) -> dict[str, float]:
-        """The `terms` of the planner tick; finite."""
-
-    @property
-    @abstractmethod
-    def achieved(self) -> bool:
-        """`success`, regardless of falls. It never ends an episode."""
-
-    @abstractmethod
-    def state(self) -> ObjectState:
-        """State of the object."""
-
-    def oracle(self) -> Array:
-        """(7,) action of the scripted solution, which may use the whole state of the simulator.
-
-        Optional; see `action_of`.
-        """
-        raise NotImplementedError
 
     @property
     def velocity_command(self) -> Array:
         """(3,) commanded vx, vy (m/s) and yaw rate (rad/s); see `needs_walking`."""
         return np.zeros(3)
 
-    def park(self) -> None:  # noqa: B027 - optional
-        """Move the objects out of sight and reach; see `in_sequence`."""
-
-    @property
-    def finished(self) -> bool:
-        """Whether the object no longer matters, such as a ball on the floor."""
-        return False
-
-    def solids(self) -> tuple[Solid, ...]:
-        """Objects in the scene besides robot and floor: by default all geoms of `add_objects`."""
-        return tuple(self._solid(geom) for geom in self.robot.index.objects[self.name])
-
-    # --- what a task may use -------------------------------------------------------------
-    def sample(self, *names: str) -> dict[str, float]:
-        """Sample ``names`` uniformly from the config's ranges ``<name>_range``, in this order.
-
-        They are `parameters` of the episode.
-        """
-        rng = self.scenario.rng("geometry")
-        ranges = ((name, getattr(self.config, f"{name}_range")) for name in names)
-        self.parameters |= {name: float(rng.uniform(*limits)) for name, limits in ranges}
-        return self.parameters
-
-    def once(self, term: str, due: bool) -> bool:
-        """Whether ``due`` is true for the first time, so that ``term`` counts once."""
-        first = due and term not in self._counted
-        if first:
-            self._counted.add(term)
-        return first
-
-    @property
-    def time(self) -> float:
-        """Seconds since the start of the episode."""
-        return self.physics_steps * PHYSICS_DT
-
-    @property
-    def since_event(self) -> float:
-        """Seconds since the event; negative before it, -inf in an empty episode."""
-        if self.event_tick is None:
-            return -np.inf
-        return (self.physics_steps - self.event_tick * PHYSICS_STEPS_PER_TICK) * PHYSICS_DT
+    def object_geoms(self) -> tuple[int, ...]:
+        """Ids of the geoms of `add_objects`."""
+        return tuple(self.robot.index.objects[self.name])
 
     def to_body(self, vector_w: Array) -> Array:
         """(3,) world vector in the axes of the pelvis heading frame."""
@@ -241,37 +113,6 @@ class Task(ABC):
                 target[part] = value
         return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
 
-    # --- the episode, driven by the environment ------------------------------------------
-    @property
-    def reward_terms(self) -> Mapping[str, str]:
-        """All reward terms, whose sum is the reward, and their columns; see `terms`."""
-        return {**self.terms, "fall": "fall", "pose": "pose", "action_rate": "action_rate"}
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the time limit is reached."""
-        return self.physics_steps >= self.ticks_limit * PHYSICS_STEPS_PER_TICK
-
-    @property
-    def current_name(self) -> str:
-        """Name of the current task, whose object `state` describes."""
-        return self.name
-
-    @property
-    def success(self) -> bool:
-        """Whether the task would count as achieved if the episode ended now."""
-        return bool(self.achieved) and not self.fallen
-
-    @property
-    def parts(self) -> dict[str, bool]:
-        """Success of each part of a sequence; empty for a single task."""
-        return {}
-
-    @property
-    def fall_cost(self) -> float:
-        """Cost of a fall."""
-        return float(self.config.fall_cost)
-
     def begin_tick(self) -> None:
         """Reset the quantities of a planner tick."""
         self.forces[:] = 0.0
@@ -288,79 +129,7 @@ class Task(ABC):
             self.forces[contact.part] = max(self.forces[contact.part], contact.force)
         self.process_contacts(contacts)
 
-    def end_tick(self, action: Array) -> dict[str, float]:
-        """Reward terms of the planner tick in which ``action`` (7,) was sent.
-
-        Raises:
-            EnvironmentFailure: the task returns other terms than it declares, or not finite ones.
-        """
-        was_fallen, self.fallen = self.fallen, self.fallen or self.has_fallen()
-        terms = self.rewards()
-        terms["fall"] = -self.fall_cost if self.fallen and not was_fallen else 0.0
-        terms["pose"] = -self._pose_cost * float(np.mean(action**2))
-        change = (action - self._last_action) / ACTION_RATE_LIMIT
-        terms["action_rate"] = -self._action_rate_cost * float(np.mean(change**2))
-        self._last_action = action.copy()
-        if terms.keys() != self.reward_terms.keys():
-            found = ", ".join(terms)
-            raise self.error(f"its rewards are {found}; expected {', '.join(self.reward_terms)}")
-        for name, value in terms.items():
-            if not math.isfinite(value):
-                raise self.error(f"its reward term {name} is {value} after {self.time:.2f} s")
-        return terms
-
     def has_fallen(self) -> bool:
         """Whether the robot lies, or is too low or too tilted to recover."""
         robot = self.robot
         return robot.pelvis_height < FALL_HEIGHT or robot.tilt > FALL_TILT or robot.on_floor
-
-    @classmethod
-    def has_oracle(cls) -> bool:
-        """Whether the task defines `oracle`."""
-        return cls.oracle is not Task.oracle
-
-    @classmethod
-    def scene_tasks(cls, config: BaseEnvConfig) -> tuple[type[Task], ...]:
-        """The tasks whose objects are in the scene, in the order in which they are added."""
-        return (cls,)
-
-    @classmethod
-    def walks(cls, config: BaseEnvConfig) -> bool:
-        """Whether the task needs a low-level controller that walks."""
-        return cls.needs_walking
-
-    @classmethod
-    def episode_config(cls, config: BaseEnvConfig) -> EpisodeConfig:
-        """Length and timing of an episode."""
-        found = getattr(config, f"{cls.name}_episode", cls.episode)
-        assert isinstance(found, EpisodeConfig), f"{cls.name} has no episode options"
-        return found
-
-    @classmethod  # noqa: B027 - optional
-    def check_options(cls, config: BaseEnvConfig) -> None:
-        """Raise `UsageError` for options that make no sense; ``config`` has those of all tasks."""
-
-    @classmethod
-    def error(cls, problem: str) -> EnvironmentFailure:
-        """The error of a defective task; the message names the class and what to do."""
-        return EnvironmentFailure(
-            f"task {cls.name} ({cls.__module__}:{cls.__qualname__}): {problem}; repair the class, "
-            f"then run egovcp-task check {cls.name}"
-        )
-
-    def _solid(self, geom: int) -> Solid:
-        model, data = self.robot.model, self.robot.data
-        kind = int(model.geom_type[geom])
-        is_sphere = kind == mujoco.mjtGeom.mjGEOM_SPHERE
-        # of other shapes than sphere and box: the bounding box
-        half = model.geom_size if kind == mujoco.mjtGeom.mjGEOM_BOX else model.geom_aabb[:, 3:]
-        x, y, z = (float(size) for size in half[geom])
-        quaternion = np.empty(4)
-        mujoco.mju_mulQuat(quaternion, data.xquat[model.geom_bodyid[geom]], model.geom_quat[geom])
-        return Solid(
-            name=model.geom(geom).name,
-            shape="sphere" if is_sphere else "box",
-            size=(x, y, z),
-            position_w=data.geom_xpos[geom].copy(),
-            quaternion_w=quaternion,
-        )

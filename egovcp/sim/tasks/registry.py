@@ -21,12 +21,12 @@ from egovcp.spec import ACTION_TERMS, REWARD_TERMS
 from egovcp.terminal import echo
 
 if TYPE_CHECKING:
-    from egovcp.sim.tasks.base import Task
+    from egovcp.sim.tasks.base_task import BaseTask
 
 GROUP: Final = "egovcp.tasks"
 #: References of further tasks, separated by commas; child processes inherit it.
 VARIABLE: Final = "EGOVCP_TASKS"
-#: Stands for all tasks of which datasets can be collected.
+#: Stands for all tasks of the G1 of which datasets can be collected.
 ALL_TASKS: Final = "all"
 #: The task of commands without ``--task``.
 DEFAULT_TASK: Final = "ball"
@@ -47,7 +47,7 @@ class TaskEntry:
     name: str
     origin: str
     """What provides it: ``egovcp 0.1.0``, or a reference."""
-    task: type[Task] | None
+    task: type[BaseTask] | None
     """None: it cannot be used because of `problem`."""
     problem: str = ""
 
@@ -113,24 +113,25 @@ def _add(name: str, origin: str, reference: str) -> TaskEntry:
     return entry
 
 
-def _load(reference: str) -> type[Task]:
+def _load(reference: str) -> type[BaseTask]:
     module, colon, name = reference.partition(":")
     if not (module and colon and name):
         raise ValueError(f"{reference!r} is no reference; expected package.module:Class")
-    from egovcp.sim.tasks.base import Task
+    from egovcp.sim.tasks.base_task import BaseTask
 
     found: Any = import_module(module)
     for part in name.split("."):
         found = getattr(found, part)
-    if not (isinstance(found, type) and issubclass(found, Task)):
-        raise ValueError(f"{reference} is no subclass of egovcp.sim.tasks.Task")
+    if not (isinstance(found, type) and issubclass(found, BaseTask)):
+        raise ValueError(f"{reference} is no subclass of Task or RobotTask of egovcp.sim.tasks")
     return found
 
 
-def _check(task: type[Task]) -> None:
+def _check(task: type[BaseTask]) -> None:
     """Raise `ValueError` unless the class is complete."""
     missing = sorted(task.__abstractmethods__)
     missing += [a for a in ("name", "description", "terms") if not hasattr(task, a)]
+    missing += _missing_of_robot(task)
     if missing:
         raise ValueError(f"the class lacks {', '.join(missing)}")
     if problem := name_problem(task.name):
@@ -144,6 +145,20 @@ def _check(task: type[Task]) -> None:
             raise ValueError(f"{term!r} is a reward term of every task; leave it out of terms")
     if inspect.isclass(task.config) or not dataclasses.is_dataclass(task.config):
         raise ValueError("config is no instance of a dataclass derived from TaskConfig")
+
+
+def _missing_of_robot(task: type[BaseTask]) -> list[str]:
+    """What the robot of a `RobotTask` lacks."""
+    from egovcp.sim.tasks.robot_task import RobotTask
+
+    if not issubclass(task, RobotTask):
+        return []
+    robot = getattr(task, "robot_class", None)
+    if robot is None:
+        return ["robot_class"]
+    missing = [*sorted(robot.__abstractmethods__)]
+    missing += [a for a in ("spec", "control_id") if not hasattr(robot, a)]
+    return [f"robot_class.{name}" for name in missing]
 
 
 def name_problem(name: str) -> str:
@@ -181,7 +196,7 @@ def register_task(reference: str) -> str:
     return entry.name
 
 
-def find_task(name: str, option: str = "") -> type[Task]:
+def find_task(name: str, option: str = "") -> type[BaseTask]:
     """The task of this name; ``option`` is named in the error.
 
     Raises:
@@ -218,7 +233,8 @@ def select_tasks(text: str, training: bool = False) -> tuple[str, ...]:
         EnvironmentFailure: the plugin of one is defective.
     """
     if text == ALL_TASKS:
-        return task_names(training=True)
+        every = task_names(training=True)
+        return tuple(name for name in every if find_task(name).robot_spec().is_g1)
     names = tuple(dict.fromkeys(text.strip("[]").replace(" ", "").split(",")))
     for name in names:
         if not find_task(name, "--task").for_training and training:

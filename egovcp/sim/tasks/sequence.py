@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final, cast
 
 import mujoco
 
@@ -49,7 +49,9 @@ class SequenceConfig:
 
 
 def _parts(config: BaseEnvConfig) -> list[type[Task]]:
-    return [find_task(name) for name in config.options_of(SequenceTask.name).parts]
+    return [
+        cast(type[Task], find_task(name)) for name in config.options_of(SequenceTask.name).parts
+    ]
 
 
 class SequenceTask(Task):

@@ -16,7 +16,7 @@ from egovcp import spec
 from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
 from egovcp.data.privileged import mirror_privileged, privileged_features
 from egovcp.data.source import read_source
-from egovcp.errors import DataError
+from egovcp.errors import DataError, UsageError
 from egovcp.model import Batch
 
 _COLUMNS = (
@@ -173,8 +173,15 @@ def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) ->
 
 
 def open_reader(root: Path, repo_id: str) -> DatasetReader:
-    """A reader of the dataset that LeRobot has loaded from ``root``."""
-    return DatasetReader(read_source(root, repo_id))
+    """A reader of the dataset that LeRobot has loaded from ``root``; `UsageError`: of another robot
+    than the G1."""
+    reader = DatasetReader(read_source(root, repo_id))
+    if not reader.robot.is_g1:
+        raise UsageError(
+            f"{reader.root} is of robot {reader.robot.robot_type}: LeRobot's commands train "
+            "policies of the G1; use egovcp-train"
+        )
+    return reader
 
 
 def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:

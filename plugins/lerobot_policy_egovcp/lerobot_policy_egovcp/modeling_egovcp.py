@@ -98,6 +98,11 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             dataset_meta: a dataset to train on further, with the same low-level controller.
         """
         artifact = load_artifact(str(pretrained_name_or_path), revision or "")
+        if not artifact.robot.is_g1:
+            raise ArtifactError(
+                f"{artifact.path} is of robot {artifact.robot.robot_type}: LeRobot's commands "
+                "drive policies of the G1; use egovcp-deploy"
+            )
         if config is None:
             config = _read_config(artifact.path)
         if artifact.world_model.object_head is None:  # as egovcp-train saves it

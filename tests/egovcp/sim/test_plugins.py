@@ -258,3 +258,30 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
 def test_options_of_the_environment_are_no_names_of_tasks() -> None:
     general = {option.name for option in fields(sim_config.BaseEnvConfig)}
     assert general < set(registry._RESERVED)
+
+
+def test_a_task_of_another_robot_needs_its_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = """
+from egovcp.sim.tasks import MujocoRobot, ObjectState, RobotTask
+
+class Robot(MujocoRobot):
+    control_id = "x"
+
+class Reach(RobotTask):
+    name, description, terms = "reach", "reach", {}
+    robot_class = Robot
+    def add_objects(spec): ...
+    place = rewards = state = achieved = None
+
+class Nobody(Reach):
+    name = "nobody"
+    robot_class = None
+"""
+    (tmp_path / "robot_tasks.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(UsageError, match=r"lacks robot_class\.build, .*\.state, .*\.spec"):
+        register_task("robot_tasks:Reach")
+    with pytest.raises(UsageError, match="lacks robot_class;"):
+        register_task("robot_tasks:Nobody")

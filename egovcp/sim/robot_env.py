@@ -1,0 +1,198 @@
+"""The environment of robots of another kind than the G1, and the choice of the environment."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import SimulationDiverged
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.env import BaseVectorEnv, Observation, StepResult, VectorEnv, one_robot
+from egovcp.sim.mujoco_robot import Array, MujocoRobot
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.registry import find_task
+from egovcp.sim.tasks.robot_task import RobotTask
+from egovcp.spec import OBJECT_DIM
+
+if TYPE_CHECKING:
+    from egovcp.sim.config import EnvConfig
+
+
+def make_env(
+    config: EnvConfig, num_envs: int, tasks: Iterable[str], render_depth: bool = True
+) -> BaseVectorEnv:
+    """The environment of the robot of ``tasks``; see `VectorEnv` and `RobotEnv`.
+
+    Raises:
+        UsageError: the tasks are of different robots.
+    """
+    names = tuple(tasks)
+    if one_robot(names).is_g1:
+        return VectorEnv(config, num_envs, render_depth=render_depth)
+    return RobotEnv(config, num_envs, robot_class(names[0]), render_depth)
+
+
+def controller_id_of(config: EnvConfig, tasks: Iterable[str]) -> str:
+    """Identity of the low-level control of the robot of ``tasks``.
+
+    Raises:
+        UsageError: the tasks are of different robots.
+    """
+    names = tuple(tasks)
+    if one_robot(names).is_g1:
+        return make_controller(config.controller).id
+    return robot_class(names[0]).control_id
+
+
+def robot_class(task: str) -> type[MujocoRobot]:
+    """The robot of a `RobotTask`."""
+    kind = find_task(task)
+    assert issubclass(kind, RobotTask), f"{task} is a task of the G1"
+    return kind.robot_class
+
+
+class RobotInstance:
+    """One robot in one episode at a time; all randomness comes from the scenario."""
+
+    def __init__(self, config: EnvConfig, scenario: Scenario, render_depth: bool) -> None:
+        self._config, self._renders = config, render_depth
+        self.start(scenario)
+
+    def start(self, scenario: Scenario) -> None:
+        """Begin the episode of ``scenario``."""
+        self.scenario = scenario
+        kind = find_task(scenario.task)
+        assert issubclass(kind, RobotTask), "checked by the environment"
+        # a fresh copy, because a task may edit the model
+        self.robot = kind.robot_class(copy.copy(kind.scene()))
+        self.robot.reset(scenario.rng("robot"))
+        self.task = kind(self._config, scenario, self.robot)
+        self.task.place()
+        self.robot.forward()
+        self.tick = 0
+        self.terminated = self.truncated = False
+        self._sense()
+
+    def advance(self, action: Array) -> None:
+        """One planner tick under a normalised action (A,).
+
+        Raises:
+            SimulationDiverged: the physics is no longer valid.
+        """
+        if self.done:
+            return
+        self.task.begin_tick()
+        self.robot.command(self.robot.spec.action_box.to_metric(action))
+        for _ in range(self.task.physics_clock()[1]):
+            self.task.step()
+        if self.robot.diverged:
+            error = SimulationDiverged(
+                f"the simulation diverged in task {self.scenario.task}, seed {self.scenario.seed}, "
+                f"episode {self.scenario.episode}, after {self.task.time:.2f} s; choose a smaller "
+                "timestep, softer actuators, or narrower ranges of the task"
+            )
+            error.episode = self.scenario.episode
+            raise error
+        self.robot.forward()
+        self._sense()
+
+    def end_tick(self, action: Array) -> dict[str, float]:
+        """Close the planner tick in which ``action`` (A,) was sent: reward terms and flags."""
+        if self.done:
+            return {}
+        self.tick += 1
+        terms = self.task.end_tick(action)
+        self.terminated = self.task.fallen
+        self.truncated = not self.terminated and self.task.is_over
+        return terms
+
+    def _sense(self) -> None:
+        self.state = np.asarray(self.robot.state(), np.float64)
+        shape = self.robot.spec.depth
+        self.depth = self.robot.depth() if self._renders else np.zeros(shape, np.uint16)
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode has ended; physics then stands still."""
+        return self.terminated or self.truncated
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The sampled parameters of this episode; ``event_tick`` is -1 without an event."""
+        event = self.task.event_tick
+        return {**self.task.parameters, "event_tick": -1 if event is None else event}
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What datasets record of the scenario."""
+        return {"event_tick": self.task.event_tick, "scene": self.task.parameters}
+
+    @property
+    def base_pose(self) -> Array:
+        """(7,) pose of the base frame in the world, m and quaternion wxyz."""
+        return self.robot.base_pose
+
+
+class RobotEnv(BaseVectorEnv):
+    """B robots of one `MujocoRobot` class, each in its own episode of any of its tasks.
+
+    Args:
+        render_depth: if false, depth images are zero, which is faster; all else is the same.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        num_envs: int,
+        robot: type[MujocoRobot],
+        render_depth: bool = True,
+    ) -> None:
+        super().__init__(config, num_envs, robot.spec)
+        self._class, self._render_depth = robot, render_depth
+
+    @property
+    def controller_id(self) -> str:
+        """`MujocoRobot.control_id`."""
+        return self._class.control_id
+
+    def _check(self, scenarios: Sequence[Scenario]) -> None:
+        one_robot([scenario.task for scenario in scenarios])
+
+    def _instance(self, scenario: Scenario) -> RobotInstance:
+        return RobotInstance(self.config, scenario, self._render_depth)
+
+    def _begin(
+        self, rows: NDArray[np.intp], controller_rows: NDArray[np.intp] | None
+    ) -> Observation:
+        self._sent[rows] = 0.0
+        return self._observe()
+
+    def step(self, action: NDArray[np.floating]) -> StepResult:
+        """Send one normalised action (B, A) per row and let a planner tick pass."""
+        self._send(action, ~self.done)
+        sent = self._sent[:, 0]
+        for row, instance in enumerate(self.instances):
+            instance.advance(sent[row])
+        return self._result([i.end_tick(sent[row]) for row, i in enumerate(self.instances)])
+
+    def _observe(self) -> Observation:
+        state = np.array([instance.state for instance in self.instances], np.float32)
+        return Observation(np.stack([instance.depth for instance in self.instances]), state)
+
+    def known_objects(self) -> NDArray[np.float32]:
+        """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
+
+        An object is known while it is within the range of the camera from the base, and still
+        matters to the task.
+        """
+        found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
+        for row, instance in enumerate(self.instances):
+            position = instance.task.object_b
+            near = np.linalg.norm(position) < self.robot.depth_max_m  # false for NaN
+            if near and not instance.task.finished:
+                found[row] = *position, 1.0
+        return found

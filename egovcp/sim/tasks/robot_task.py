@@ -1,0 +1,120 @@
+"""Base class of the tasks of a robot of another kind than the G1."""
+
+from __future__ import annotations
+
+import itertools
+from functools import cache
+from typing import Any, ClassVar, Final
+
+import mujoco
+import numpy as np
+
+from egovcp.errors import EgovcpError
+from egovcp.robot_spec import RobotSpec
+from egovcp.sim.mujoco_robot import MujocoRobot
+from egovcp.sim.tasks.base_task import Array, BaseTask, Solid
+
+_CONSTANTS: Final = (-0.7, 0.0, 0.7)
+_GRID_ACTIONS: Final = 4  # more would make the grid of constant actions too large
+
+
+class RobotTask(BaseTask):
+    """One episode of a task of `robot_class`.
+
+    Class attributes describe the task, `add_objects` adds its objects to the scene of the robot.
+    Per episode: ``__init__`` samples parameters, `place` sets the start state. Then, per physics
+    step: `before_step`, physics, `after_step`; per planner tick: `rewards`. All randomness comes
+    from `sample` and `scenario`. Positions of `state` are in the world.
+    """
+
+    robot_class: ClassVar[type[MujocoRobot]]
+    """The robot that does the task."""
+    robot: Any
+    """The instance of `robot_class` of this episode."""
+
+    @classmethod
+    def robot_spec(cls) -> RobotSpec:
+        """``robot_class.spec``."""
+        return cls.robot_class.spec
+
+    @classmethod
+    def physics_clock(cls) -> tuple[float, int]:
+        """Duration of a physics step, s, and physics steps per planner tick."""
+        timestep = float(cls.scene().opt.timestep)
+        return timestep, cls.robot_class.physics_clock(timestep)
+
+    @classmethod
+    def constant_actions(cls) -> list[tuple[float, ...]]:
+        """A grid of three values of every action, or with many of them of one at a time."""
+        count = cls.robot_spec().action_dim
+        if count <= _GRID_ACTIONS:
+            return list(itertools.product(_CONSTANTS, repeat=count))
+        rows = [value * row for row in np.eye(count) for value in _CONSTANTS if value]
+        return [tuple(row.tolist()) for row in rows]
+
+    @classmethod
+    def scene(cls) -> mujoco.MjModel:
+        """The model of robot and objects, compiled once.
+
+        Raises:
+            EnvironmentFailure: it does not compile, or does not fit the robot's description.
+        """
+        return _scene(cls)
+
+    def after_step(self) -> None:
+        """Look at the scene after a physics step, such as for contacts."""
+
+    def step(self) -> None:
+        """Act on the scene and do one physics step."""
+        self.before_step()
+        self.robot.step()
+        self.physics_steps += 1
+        self.after_step()
+
+    def has_fallen(self) -> bool:
+        """Whether the episode has failed, which ends it; by default never."""
+        return False
+
+    def object_geoms(self) -> tuple[int, ...]:
+        """Ids of the geoms of `add_objects`."""
+        return _object_geoms(type(self))
+
+    def solids(self) -> tuple[Solid, ...]:
+        """The objects, and the links of the robot; without planes."""
+        model = self.robot.model
+        links = [i for i in range(model.ngeom) if i not in self.object_geoms()]
+        planes = {i for i in links if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE}
+        return super().solids() + tuple(self._solid(i) for i in links if i not in planes)
+
+    @property
+    def object_b(self) -> Array:
+        """(3,) position of the object, m, base frame of the robot."""
+        pose = self.robot.base_pose
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, pose[3:])
+        position: Array = (self.state().position_w - pose[:3]) @ rotation.reshape(3, 3)
+        return position
+
+
+@cache
+def _scene(cls: type[RobotTask]) -> mujoco.MjModel:
+    robot = cls.robot_class
+    try:
+        spec = robot.build()
+        cls.add_objects(spec)
+        model = spec.compile()
+        robot(model)
+    except EgovcpError:
+        raise
+    except Exception as error:
+        raise cls.error(f"its scene cannot be made: {error}") from error
+    return model
+
+
+@cache
+def _object_geoms(cls: type[RobotTask]) -> tuple[int, ...]:
+    known = cls.robot_class.build().compile()
+    names = {known.body(i).name for i in range(known.nbody)}
+    model = cls.scene()
+    new = [i for i in range(model.nbody) if model.body(i).name not in names]
+    return tuple(g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in new)
