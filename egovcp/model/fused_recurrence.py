@@ -29,9 +29,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from egovcp.model.latent_state import SHIFT, Carry, Gaussian
+from egovcp.model.layer_gradients import LayerNorm, matrix_gradient, silu_gradient
 from egovcp.model.world_model import WorldModel
-
-_EPSILON = 1e-5  # of all layer norms
 
 
 def filter_window(
@@ -83,7 +82,11 @@ def imagine_window(
             imagined further.
     """
     if type(model) is not WorldModel:
-        return _imagine_by_steps(model, start, action, rows)
+        carries, carry = list[Carry](), start
+        for act in action.split_with_sizes(list(rows)):
+            carry = model.imagine(Carry(carry.h[: len(act)], carry.z[: len(act)]), act)
+            carries.append(carry)
+        return carries
     weights = _weights(model, model.prior.first.parts[0], model.prior.rest)
     outputs = _run(model, weights, rows, start, action)
     parts = (x.split_with_sizes(list(rows)) for x in (outputs.h, outputs.z))
@@ -111,16 +114,6 @@ def _filter_by_steps(
     return Carry.join(carries, lambda parts: torch.stack(parts, 1)), Gaussian(means, stds)
 
 
-def _imagine_by_steps(
-    model: WorldModel, carry: Carry, action: Tensor, rows: Sequence[int]
-) -> list[Carry]:
-    carries: list[Carry] = []
-    for act in action.split_with_sizes(list(rows)):
-        carry = model.imagine(Carry(carry.h[: len(act)], carry.z[: len(act)]), act)
-        carries.append(carry)
-    return carries
-
-
 class _Weights(NamedTuple):
     """Weights of the recurrence; U units, Z latent, H hidden."""
 
@@ -146,50 +139,10 @@ class _Outputs(NamedTuple):
     std: Tensor
 
 
-def _norms_mixed_dtypes(device: torch.device) -> bool:
-    """Whether the layer norm kernel takes bfloat16 inputs with float32 weights."""
-    return device.type == "cpu"
-
-
-class _LayerNorm(NamedTuple):
-    """Input x and output y (R, n) of a layer norm, mean and 1 / std (R, 1)."""
-
-    x: Tensor
-    y: Tensor
-    mean: Tensor
-    rstd: Tensor
-
-    @classmethod
-    def apply(cls, x: Tensor, scale: Tensor, shift: Tensor) -> _LayerNorm:
-        if not _norms_mixed_dtypes(x.device):
-            x = x.to(scale.dtype)
-        return cls(x, *torch.native_layer_norm(x, scale.shape, scale, shift, _EPSILON))
-
-    def input_gradient(self, gradient: Tensor, scale: Tensor) -> Tensor:
-        return self._gradients(gradient, scale, (True, False, False))[0]
-
-    def weight_gradients(self, gradient: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-        _, of_scale, of_shift = self._gradients(gradient, scale, (False, True, True))
-        return of_scale, of_shift
-
-    def _gradients(
-        self, gradient: Tensor, scale: Tensor, which: tuple[bool, bool, bool]
-    ) -> tuple[Tensor, ...]:
-        gradients: tuple[Tensor, ...] = torch.ops.aten.native_layer_norm_backward(
-            gradient, self.x, scale.shape, self.mean, self.rstd, scale, scale, which
-        )
-        return gradients
-
-    def steps(self, rows: Sequence[int]) -> list[_LayerNorm]:
-        """Split into one per step."""
-        parts = (x.split_with_sizes(list(rows)) for x in self)
-        return [_LayerNorm(*part) for part in zip(*parts, strict=True)]
-
-
 class _Norms(NamedTuple):
-    mix: _LayerNorm
-    gates: _LayerNorm
-    head: _LayerNorm
+    mix: LayerNorm
+    gates: LayerNorm
+    head: LayerNorm
 
 
 class _Saved(NamedTuple):
@@ -283,7 +236,7 @@ class _Recurrence(torch.autograd.Function):
     def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor | None, ...]:
         first, noise, *rest = ctx.saved_tensors
         saved, rest = _Saved(*rest[: len(_Saved._fields)]), rest[len(_Saved._fields) :]
-        norms = _Norms(*(_LayerNorm(*rest[i : i + 4]) for i in (0, 4, 8)))
+        norms = _Norms(*(LayerNorm(*rest[i : i + 4]) for i in (0, 4, 8)))
         weights = _Weights(*rest[12:])
         found = _backward(_Outputs(*outer), saved, norms, weights, ctx.rows, first, noise)
         embedding = found.embedding if ctx.needs_input_grad[4] else None
@@ -298,7 +251,7 @@ def _forward(
     first: Tensor | None,
     noise: Tensor | None,
     w: _Weights,
-) -> tuple[_Outputs, _Saved | None, list[_LayerNorm]]:
+) -> tuple[_Outputs, _Saved | None, list[LayerNorm]]:
     """In rows: action (R, U), embedding (R, U), first (R, 1), noise (R, Z)."""
     p, rows, (h, z) = constants.dtype, list(constants.rows), start
     mix, gru, head, out = (x.to(p).t() for x in (w.mix, w.gru, w.head, w.out))
@@ -318,16 +271,16 @@ def _forward(
         if starts_t is not None:  # replaced, not multiplied by zero, so that a reset removes NaN
             h, z = h.masked_fill(starts_t, 0.0), z.masked_fill(starts_t, 0.0)
         latent, before = z.to(p), h
-        mixed = _LayerNorm.apply(torch.addmm(act, latent, mix), w.mix_scale, w.mix_shift)
+        mixed = LayerNorm.apply(torch.addmm(act, latent, mix), w.mix_scale, w.mix_shift)
         inputs = torch.cat([F.silu(mixed.y).to(p), h.to(p)], 1)
-        gates = _LayerNorm.apply(inputs @ gru, w.gru_scale, w.gru_shift)
+        gates = LayerNorm.apply(inputs @ gru, w.gru_scale, w.gru_shift)
         reset, candidate, update = gates.y.chunk(3, -1)
         reset, update = torch.sigmoid(reset), torch.sigmoid(update)
         candidate = torch.tanh(reset * candidate)
         h = torch.lerp(h, candidate.to(h.dtype), update.to(h.dtype))
         state = h.to(p)
         raw = state @ head if seen is None else torch.addmm(seen, state, head)
-        read = _LayerNorm.apply(raw, w.head_scale, w.head_shift)
+        read = LayerNorm.apply(raw, w.head_scale, w.head_shift)
         hidden = F.silu(read.y).to(p)
         mean, spread = torch.addmm(out_shift, hidden, out).to(h.dtype).chunk(2, -1)
         std = F.softplus(spread + SHIFT) + constants.min_std
@@ -341,7 +294,7 @@ def _forward(
     whole = _Outputs(*map(torch.cat, zip(*outputs, strict=True)))
     if not constants.save:
         return whole, None, []
-    joined = [_LayerNorm(*map(torch.cat, zip(*x, strict=True))) for x in zip(*norms, strict=True)]
+    joined = [LayerNorm(*map(torch.cat, zip(*x, strict=True))) for x in zip(*norms, strict=True)]
     return whole, _Saved(*map(torch.cat, zip(*saved, strict=True))), joined
 
 
@@ -378,7 +331,7 @@ def _backward(
         later = len(d_h)
         direct[:later].addcmul_(torch.cat([d_z, d_z], 1), z_slope[:later])
         d_logits = direct.to(p)
-        d_head_norm = _silu_gradient(d_logits @ out, read.y)
+        d_head_norm = silu_gradient(d_logits @ out, read.y)
         d_head = read.input_gradient(d_head_norm, w.head_scale).to(p)
         d_new += d_head @ head
         d_new[:later] += d_h
@@ -387,7 +340,7 @@ def _backward(
         ).flatten(1)
         d_gates = gates.input_gradient(d_gates_norm, w.gru_scale).to(p)
         d_inputs = d_gates @ gru
-        d_mix_norm = _silu_gradient(d_inputs[:, :units], mixed.y)
+        d_mix_norm = silu_gradient(d_inputs[:, :units], mixed.y)
         d_mix = mixed.input_gradient(d_mix_norm, w.mix_scale).to(p)
         d_h = d_new * kept + d_inputs[:, units:]
         d_z = (d_mix @ mix).to(d_h.dtype)
@@ -398,13 +351,13 @@ def _backward(
         torch.cat(step[::-1]) for step in zip(*history, strict=True)
     )
     weights = _Weights(
-        _matrix_gradient(d_mix, saved.latent, w.mix),
+        matrix_gradient(d_mix, saved.latent, w.mix),
         *norms.mix.weight_gradients(d_mix_norm, w.mix_scale),
-        _matrix_gradient(d_gates, saved.inputs, w.gru),
+        matrix_gradient(d_gates, saved.inputs, w.gru),
         *norms.gates.weight_gradients(d_gates_norm, w.gru_scale),
-        _matrix_gradient(d_head, saved.new_state, w.head),
+        matrix_gradient(d_head, saved.new_state, w.head),
         *norms.head.weight_gradients(d_head_norm, w.head_scale),
-        _matrix_gradient(d_logits, saved.hidden, w.out),
+        matrix_gradient(d_logits, saved.hidden, w.out),
         d_logits_direct.sum(0),
     )
     return _Gradients(d_h, d_z, d_mix, d_head, weights)
@@ -420,16 +373,6 @@ def _episode_starts(first: Tensor | None, rows: Sequence[int]) -> list[Tensor | 
         return [step[:, None] for step in steps]
     some = steps.any(1).tolist()
     return [step[:, None] if any_ else None for step, any_ in zip(steps, some, strict=True)]
-
-
-def _silu_gradient(gradient: Tensor, x: Tensor) -> Tensor:
-    result: Tensor = torch.ops.aten.silu_backward(gradient.to(x.dtype), x)
-    return result
-
-
-def _matrix_gradient(d_product: Tensor, factor: Tensor, like: Tensor) -> Tensor:
-    """Gradient (m, n) of a matrix from that of its products (R, m) with a factor (R, n)."""
-    return (d_product.t() @ factor).to(like.dtype)
 
 
 def _gate_slopes(saved: _Saved, gates: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.model import Carry, WorldModel, fused_recurrence
+from egovcp.model import Carry, WorldModel, layer_gradients
 from egovcp.model.fused_recurrence import filter_window, imagine_window
 from egovcp.model.latent_state import Gaussian
 from egovcp.testing import toy_model
@@ -132,7 +132,7 @@ def test_in_bfloat16_it_goes_the_same_way(
     case: str, mixed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where norms want one type for numbers and weights, as on GPUs."""
-    monkeypatch.setattr(fused_recurrence, "_norms_mixed_dtypes", lambda device: mixed)
+    monkeypatch.setattr(layer_gradients, "_norms_mixed_dtypes", lambda device: mixed)
     inputs, window, _ = CASES[case]
     model = toy_model()
     exact = _gradients(window, model, inputs(model))
