@@ -23,7 +23,7 @@ AWAY = (0.0, 0.0, -1.0)  # m, below the table
 
 
 @dataclass(frozen=True)
-class ReachConfig(TaskConfig):
+class ReachTaskConfig(TaskConfig):
     """A ball within the reach of the arm."""
 
     distance_range: Range = bounded((0.24, 0.42), least=0.05, most=1)
@@ -46,7 +46,7 @@ class ReachTask(RobotTask):
     description = "reach below a ball that appears above the table"
     event = "ball appears"
     terms = {"near": "pass"}
-    config: ReachConfig = ReachConfig()
+    config: ReachTaskConfig = ReachTaskConfig()
     episode = EpisodeConfig(ticks=60, event_ticks=(2, 15))
     short_episode = EpisodeConfig(ticks=50, event_ticks=(0, 6), empty_probability=0.05)
 
