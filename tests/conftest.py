@@ -18,6 +18,14 @@ from tests.support.hub import FakeHub, in_this_process
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.fixture(autouse=True)
+def interrupt_handler() -> Iterator[None]:
+    """Restore the handler of Ctrl-C, which commands replace."""
+    handler = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
 @pytest.fixture
 def mount_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder that the system reports as a mount point."""

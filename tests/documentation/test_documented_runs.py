@@ -50,6 +50,7 @@ _ELSEWHERE = {
     "--mapping": "tests/deploy/mcap/test_topics.py",
     "egovcp-task": "tests/deploy/test_task.py",
     "--task=bag": "tests/test_examples.py",
+    "--task=arm_task": "tests/test_examples.py",
     "data/bag": "tests/test_examples.py",
 }
 #: Repository on the fake Hub -> folder.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import queue
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
+from egovcp.workers import stop_on_signal
 from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
@@ -80,9 +82,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(FakeG1Config, run, argv, prog=PROG, epilog=_EPILOG)
 
 
-def run(config: FakeG1Config, opened: Callable[[Ports], None] = lambda ports: None) -> None:
-    """Serve until the episodes are over or the user ends it; ``opened`` is called with the ports
-    once the robot listens. Raises `EnvironmentFailure` if a port is in use."""
+def run(config: FakeG1Config) -> None:
+    """Serve until the episodes are over or the user ends it.
+
+    Raises:
+        EnvironmentFailure: a port is in use.
+    """
     first = held_out(config.task, config.seed, config.episode)
     robot = LiveRobot(config.env)
     robot.start(first)
@@ -96,27 +101,32 @@ def run(config: FakeG1Config, opened: Callable[[Ports], None] = lambda ports: No
     episodes = EpisodeSequencer(
         bridge, scenario, _print, config.gantry, config.settle, config.pause
     )
-    try:
-        opened(bridge.ports)
-        _serve(config, bridge, episodes)
-    except KeyboardInterrupt:
+    with stop_on_signal(signals=(signal.SIGINT,)) as interrupts:
+        try:
+            _serve(config, bridge, episodes, interrupts)
+        finally:
+            bridge.close()
+    if interrupts:
         _print("interrupted")
-    finally:
-        bridge.close()
-        if outcomes := episodes.outcomes:
-            successes = sum(outcome.success for outcome in outcomes)
-            _print(f"{len(outcomes)} episodes, {successes} successes")
+    if outcomes := episodes.outcomes:
+        successes = sum(outcome.success for outcome in outcomes)
+        _print(f"{len(outcomes)} episodes, {successes} successes")
 
 
-def _serve(config: FakeG1Config, bridge: FakeBridge, episodes: EpisodeSequencer) -> None:
-    """Step in real time."""
+def _serve(
+    config: FakeG1Config,
+    bridge: FakeBridge,
+    episodes: EpisodeSequencer,
+    interrupts: Sequence[int],
+) -> None:
+    """Step in real time until there is an interrupt."""
     ports = bridge.ports
     _print(
         f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
         f"depth {ports.camera_port}; Ctrl-C ends it"
     )
     console, pacer, written = Console(), StepPacer(MonotonicClock()), 0
-    while not episodes.finished:
+    while not (episodes.finished or interrupts):
         for _ in range(pacer.wait_for_steps()):
             episodes.step()
         if not console.process(bridge.faults):
