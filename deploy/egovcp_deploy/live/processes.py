@@ -174,11 +174,11 @@ def simulated_robot(
 
 def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:
     """Runs in the simulator's process."""
-    from egovcp_deploy.robots.fake.command import run
+    from egovcp_deploy.robots.fake.command import serve
 
     die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
-    run(fake, lambda ports: pipe.send((ports.command_port, ports.state_port, ports.camera_port)))
+    serve(fake, lambda ports: pipe.send((ports.command_port, ports.state_port, ports.camera_port)))
 
 
 def _received_ports(pipe: Connection) -> tuple[int, int, int]:

@@ -83,7 +83,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(config: FakeG1Config) -> None:
-    """Serve until the episodes are over or the user ends it.
+    """Serve until the episodes are over or the user interrupts it."""
+    with stop_on_signal(signals=(signal.SIGINT,)) as interrupts:
+        serve(config, interrupts=interrupts)
+    if interrupts:
+        _print("interrupted")
+
+
+def serve(
+    config: FakeG1Config,
+    opened: Callable[[Ports], None] = lambda ports: None,
+    interrupts: Sequence[int] = (),
+) -> None:
+    """Serve until the episodes are over or there is an interrupt.
+
+    Args:
+        config: the options.
+        opened: called with the ports once the robot listens.
+        interrupts: a list that a signal handler extends.
 
     Raises:
         EnvironmentFailure: a port is in use.
@@ -101,25 +118,22 @@ def run(config: FakeG1Config) -> None:
     episodes = EpisodeSequencer(
         bridge, scenario, _print, config.gantry, config.settle, config.pause
     )
-    with stop_on_signal(signals=(signal.SIGINT,)) as interrupts:
-        try:
-            _serve(config, bridge, episodes, interrupts)
-        finally:
-            bridge.close()
-    if interrupts:
-        _print("interrupted")
-    if outcomes := episodes.outcomes:
-        successes = sum(outcome.success for outcome in outcomes)
-        _print(f"{len(outcomes)} episodes, {successes} successes")
+    try:
+        opened(bridge.ports)
+        _step_in_real_time(config, bridge, episodes, interrupts)
+    finally:
+        bridge.close()
+        if outcomes := episodes.outcomes:
+            successes = sum(outcome.success for outcome in outcomes)
+            _print(f"{len(outcomes)} episodes, {successes} successes")
 
 
-def _serve(
+def _step_in_real_time(
     config: FakeG1Config,
     bridge: FakeBridge,
     episodes: EpisodeSequencer,
     interrupts: Sequence[int],
 ) -> None:
-    """Step in real time until there is an interrupt."""
     ports = bridge.ports
     _print(
         f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
