@@ -164,17 +164,22 @@ def make_plan[C](
 
 def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tensor:
     """Discounted costs (E, M) of poses and action changes in plans (E, M, A, 7) from a_{t-1}
-    (E, 1, 7), over the horizon N:
+    (E, 1, 7):
 
-    sum_{k<N} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
+    sum_{k<K} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
+
+    K is the horizon N. Under ``objective=value`` it is `spec.RETURN_STEPS`, the number of steps
+    whose rewards Q counts, if that is more: after the plan the last action is held.
     """
     actions = actions[..., : config.horizon, :]
     before = torch.cat([start[:, None].expand_as(actions[..., :1, :]), actions[..., :-1, :]], -2)
     change = (actions - before) / spec.ACTION_RATE_LIMIT
-    per_step = config.pose_cost * actions.square().mean(-1)
-    per_step = per_step + config.action_rate_cost * change.square().mean(-1)
-    discount = spec.GAMMA ** torch.arange(config.horizon, device=actions.device)
-    return (per_step * discount).sum(-1)
+    pose = config.pose_cost * actions.square().mean(-1)
+    steps = max(config.horizon, spec.RETURN_STEPS if config.objective == "value" else 0)
+    discount = spec.GAMMA ** torch.arange(steps, device=actions.device)
+    during, after = discount[: config.horizon], discount[config.horizon :].sum()
+    rate = config.action_rate_cost * change.square().mean(-1)
+    return ((pose + rate) * during).sum(-1) + pose[..., -1] * after
 
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> SearchState:

@@ -69,14 +69,14 @@ def test_the_best_reachable_plan_is_found(seed: int) -> None:
 
 def test_pose_cost_moves_the_plan_towards_neutral() -> None:
     """Q is -|a - goal|^2, so that a plan that holds a loses 7 (goal - a)^2 and costs c g a^2, where
-    g is the sum of gamma^k over the horizon: for c = 7 / g the best a is goal / 2."""
+    g is the sum of gamma^k over the steps of a return: for c = 7 / g the best a is goal / 2."""
     executed, goal = torch.full((1, 7), 0.2), torch.full((1, 7), 0.4)
     config = plain_planner(
         samples=512, elites=16, iterations=8, min_std=0.02, action_parameterization="target"
     )
     free = _plan(executed, goal, config).actions[0, -1]
     torch.testing.assert_close(free, goal[0], atol=0.05, rtol=0)
-    discounts = sum(spec.GAMMA**k for k in range(config.horizon))
+    discounts = sum(spec.GAMMA**k for k in range(spec.RETURN_STEPS))
     costly = dataclasses.replace(config, pose_cost=7 / discounts)
     held = _plan(executed, goal, costly).actions[0, -1]
     torch.testing.assert_close(held, goal[0] / 2, atol=0.05, rtol=0)
