@@ -98,10 +98,10 @@ class Artifact:
         """Raise `ArtifactError` unless the robot runs the controller of the data."""
         if controller_id != self.controller_id:
             raise ArtifactError(
-                f"{self.path} was trained on data of low-level controller {self.controller_id!r}, "
-                f"but the robot runs {controller_id!r}; choose the data's "
-                "(--env.controller in simulation, --robot.controller on a robot), or collect data "
-                "with this one and train again"
+                f"{self.path} was trained on data of robot {self.robot.robot_type} with low-level "
+                f"controller {self.controller_id!r}, but this robot has {controller_id!r}; give a "
+                "policy of this robot, or choose the data's controller (--env.controller in "
+                "simulation, --robot.controller on a robot)"
             )
 
 

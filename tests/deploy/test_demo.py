@@ -65,7 +65,7 @@ def test_a_single_task_and_an_own_policy(
         (["--task=bal"], 2, "did you mean 'ball'"),
         (["--policy.path="], 2, "--policy.path is missing"),
         (["--policy.path=/nowhere"], 4, "/nowhere"),
-        (["--env.controller=walk"], 4, "was trained on data of low-level controller"),
+        (["--env.controller=walk"], 4, "with low-level controller"),
         (["--episodes=3"], 2, "--episodes"),
     ],
 )
