@@ -9,10 +9,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
-from importlib import metadata
+from importlib import import_module, metadata
 from importlib.util import find_spec
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -153,3 +153,21 @@ def _extras(distribution: str) -> list[str]:
 
 def _is_own(distribution: str) -> bool:
     return distribution in _OWN or distribution.startswith("egovcp-")
+
+
+def import_class[T](reference: str, base: type[T], known_as: str) -> type[T]:
+    """The subclass of ``base`` at ``package.module:Class``; ``known_as`` is its public name.
+
+    Raises:
+        ValueError: the reference has another form, or names something else.
+        ImportError, AttributeError, ...: whatever the import raises.
+    """
+    module, colon, name = reference.partition(":")
+    if not (module and colon and name):
+        raise ValueError(f"{reference!r} is no reference; expected package.module:Class")
+    found: Any = import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{reference} is no subclass of {known_as}")
+    return found

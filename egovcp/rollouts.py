@@ -13,10 +13,10 @@ import numpy as np
 from egovcp.data import DatasetReader, Episode
 from egovcp.errors import DataError
 from egovcp.log.tick import CameraView, RunInfo, Tick
+from egovcp.rate import NS_PER_S
 from egovcp.robot_spec import RobotSpec
 from egovcp.spec import PLANNER_HZ
 
-NS_PER_S: Final = 1_000_000_000
 #: Key of `RunInfo.hashes` that names the low-level controller.
 CONTROLLER: Final = "low_level_controller"
 POSE: Final = (

@@ -7,6 +7,7 @@ import runpy
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from egovcp.checks import ConformanceError, check_robot, check_task
@@ -80,6 +81,19 @@ def test_another_robot_conforms(monkeypatch: pytest.MonkeyPatch) -> None:
         check_robot(lagging)
     with pytest.raises(UsageError, match=r"expected package\.module:Class"):
         check_robot("arm_robot:Nothing")
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_a_damped_robot_no_longer_follows(damped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(_ARM))
+    arm = importlib.import_module("arm_robot").PlanarArm
+    robot = arm(arm.build().compile())
+    if damped:
+        robot.damp()
+    robot.command(np.full(3, 0.5))
+    for _ in range(100):
+        robot.step()
+    assert (np.abs(robot.data.qpos).max() < 1e-6) == damped
 
 
 def test_the_commands_serve_another_robot(

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import Episode
-from egovcp.sim.env import BaseVectorEnv, Observation, StepResult
-from egovcp.sim.instance import EnvInstance
+from egovcp.sim.base_env import BaseInstance, BaseVectorEnv, Observation, StepResult
 from egovcp.sim.policies import RandomWalk
-from egovcp.sim.robot_env import RobotInstance, make_env
+from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import HANDS
 from egovcp.spec import REWARD_TERMS
 from egovcp_collect.config import CollectConfig
 
@@ -108,7 +106,7 @@ class EpisodeRecord:
         self._rows: dict[str, list[Any]] = defaultdict(list)
         self._term_sums: dict[str, float] = defaultdict(float)
         self._term_ticks: Counter[str] = Counter()
-        self._hand_contacts = self._other_contacts = 0
+        self._contact_ticks: Counter[str] = Counter()
 
     def add(
         self,
@@ -116,7 +114,7 @@ class EpisodeRecord:
         known_object: NDArray[np.float32],
         result: StepResult,
         row: int,
-        instance: EnvInstance | RobotInstance,
+        instance: BaseInstance,
     ) -> None:
         """Append row ``row`` of the environment: the observation before a step, the object (4,) at
         that time, and the result of the step."""
@@ -141,19 +139,10 @@ class EpisodeRecord:
         for name in columns:
             self._term_sums[name] += terms[name]
             self._term_ticks[name] += terms[name] != 0
-        if isinstance(instance, EnvInstance):
-            touched = instance.task.forces > 0
-            hands = touched[list(HANDS)]
-            self._hand_contacts += int(hands.any())
-            self._other_contacts += int(touched.sum() > hands.sum())
+        for group, touched in instance.contacts().items():
+            self._contact_ticks[group] += touched
 
-    def _contacts(self, instance: EnvInstance | RobotInstance) -> dict[str, Any]:
-        """Contacts of the parts of a G1."""
-        if not isinstance(instance, EnvInstance):
-            return {}
-        return {"contact_ticks": {"hands": self._hand_contacts, "other": self._other_contacts}}
-
-    def episode(self, instance: EnvInstance | RobotInstance) -> Episode:
+    def episode(self, instance: BaseInstance) -> Episode:
         """The finished episode."""
         rows: dict[str, Any] = {name: np.stack(values) for name, values in self._rows.items()}
         return Episode(
@@ -169,6 +158,6 @@ class EpisodeRecord:
                     name: {"sum": self._term_sums[name], "ticks": self._term_ticks[name]}
                     for name in instance.task.reward_terms
                 },
-                **self._contacts(instance),
+                **({"contact_ticks": dict(self._contact_ticks)} if self._contact_ticks else {}),
             },
         )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from egovcp.errors import DataError
 from egovcp.files import UnsafeFileError, read_json
 from egovcp.plan import PolicyStep
-from egovcp.sim.env import BaseVectorEnv
+from egovcp.sim.base_env import BaseVectorEnv
 from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
 from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import Scenario

@@ -22,8 +22,8 @@ from egovcp.hardware import available_cores
 from egovcp.plan import blank_observation
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
+from egovcp.sim.base_env import BaseVectorEnv
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import BaseVectorEnv
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers

@@ -9,7 +9,7 @@ from egovcp.log.tick import Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import NS_PER_S
 from egovcp.robot_spec import G1
-from egovcp.sim.env import BaseVectorEnv, Observation
+from egovcp.sim.base_env import BaseVectorEnv, Observation
 from egovcp_deploy.options import video_paths
 from egovcp_deploy.pilot.planner import RolloutPolicy
 from egovcp_deploy.robots.sim import true_poses

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import ConformanceError, UsageError
+from egovcp.packages import import_class
 from egovcp.robot_spec import RobotSpec
 from egovcp.spec import ACTION_RATE_LIMIT
 
@@ -91,16 +91,12 @@ def check_robot(robot: type[MujocoRobot] | str, ticks: int = 40, seed: int = 0) 
 def _load(reference: str) -> type[MujocoRobot]:
     from egovcp.sim.mujoco_robot import MujocoRobot
 
-    module, _, name = reference.partition(":")
     try:
-        found: Any = getattr(import_module(module), name)
+        return import_class(reference, MujocoRobot, "egovcp.sim.tasks.MujocoRobot")  # type: ignore[type-abstract]
     except (ImportError, AttributeError, ValueError) as error:
         raise UsageError(
             f"no robot {reference!r} ({error}); expected package.module:Class"
         ) from error
-    if not (isinstance(found, type) and issubclass(found, MujocoRobot)):
-        raise UsageError(f"{reference} is no subclass of egovcp.sim.tasks.MujocoRobot")
-    return found
 
 
 def _play(robot: MujocoRobot, actions: Array, seed: int) -> tuple[Array, NDArray[np.uint16]]:
@@ -115,7 +111,6 @@ def _play(robot: MujocoRobot, actions: Array, seed: int) -> tuple[Array, NDArray
         for _ in range(steps):
             robot.step()
         robot.forward()
-
         if robot.diverged:
             raise ConformanceError(
                 f"robot {name}, tick {t}: the physics diverged; use a smaller timestep"

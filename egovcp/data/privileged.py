@@ -46,5 +46,5 @@ def privileged_features(
 
 
 def mirror_privileged[F: np.floating](features: NDArray[F]) -> NDArray[F]:
-    """Reflected features (..., `DIM`), see `egovcp.data.mirror`."""
+    """Reflected features (..., `DIM`), see `RobotSpec.mirror`."""
     return np.asarray(features * _SIGN.astype(features.dtype))

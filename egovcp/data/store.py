@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from egovcp.data import privileged
 from egovcp.data.episode import Episode, FrameLayout, frame_layout
 from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, episodes_fingerprint
-from egovcp.data.mirror import mirror_depth
 from egovcp.data.reader import DatasetReader
 from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.robot_spec import G1, RobotSpec
@@ -189,8 +188,9 @@ def gather(
 
 
 def mirror_windows(batch: Batch, windows: NDArray[np.intp], robot: RobotSpec = G1) -> None:
-    """Reflect some windows of a batch of a symmetric robot left to right, in place."""
-    batch["depth"][windows] = mirror_depth(batch["depth"][windows])
+    """Reflect some windows of a batch of a symmetric robot left to right, in place; its camera is
+    in the plane of symmetry."""
+    batch["depth"][windows] = batch["depth"][windows, ..., ::-1]
     batch["state"][windows] = robot.mirrored_state(batch["state"][windows])
     batch["privileged"][windows] = privileged.mirror_privileged(batch["privileged"][windows])
     for name in ("action", "prev_action"):

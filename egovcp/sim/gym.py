@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController
 from egovcp.sim import config as sim_config
-from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.base_env import Observation
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task, task_names

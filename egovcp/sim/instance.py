@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure, SimulationDiverged
 from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.stance_table import StandingPose, standing_pose
+from egovcp.sim.base_env import BaseInstance
 from egovcp.sim.camera import DepthNoise, RayCastCamera, RayCaster
 from egovcp.sim.config import RandomisationConfig, SensorConfig
 from egovcp.sim.robot import Proprioception, SimulatedRobot
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import Scene, build_scene
+from egovcp.sim.scene import HANDS, Scene, build_scene
 from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
 from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task
 from egovcp.spec import (
@@ -124,7 +125,7 @@ def settle(config: EnvConfig, controller: LowLevelController) -> StandingPose:
     return StandingPose(np.array([0.0, 0.0, q[2]]), q[3:7], q[scene.index.joint_qpos])
 
 
-class EnvInstance:
+class EnvInstance(BaseInstance):
     """Simulates one robot in one episode at a time; all randomness comes from the scenario.
 
     A depth image of age k is rendered k controller ticks before the planner tick that observes it;
@@ -214,16 +215,17 @@ class EnvInstance:
             "scene": self.task.parameters,
         }
 
+    def contacts(self) -> dict[str, bool]:
+        """Whether the ``hands``, and whether ``other`` parts, touched the object in this tick."""
+        touched = self.task.forces > 0
+        hands = touched[list(HANDS)]
+        return {"hands": bool(hands.any()), "other": bool(touched.sum() > hands.sum())}
+
     @property
     def base_pose(self) -> Array:
         """(7,) pose of the pelvis in the world, m and quaternion wxyz."""
         pose: Array = self.robot.data.qpos[:7].copy()
         return pose
-
-    @property
-    def done(self) -> bool:
-        """Whether the episode has ended; physics then stands still."""
-        return self.terminated or self.truncated
 
     @property
     def depth(self) -> NDArray[np.uint16]:
@@ -286,13 +288,3 @@ class EnvInstance:
         """(H, W) mm: a depth image of the current body poses, with the camera's noise."""
         depth = self._camera.render(self._caster, self.robot.data, self.camera_pitch)
         return self._noise.apply(depth)
-
-    def end_tick(self, action: Array) -> dict[str, float]:
-        """Close the planner tick in which ``action`` (7,) was sent: reward terms and flags."""
-        if self.done:
-            return {}
-        self.tick += 1
-        terms = self.task.end_tick(action)
-        self.terminated = self.task.fallen
-        self.truncated = not self.terminated and self.task.is_over
-        return terms

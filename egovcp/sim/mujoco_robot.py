@@ -78,6 +78,11 @@ class MujocoRobot(ABC):
         """Follow ``target`` (A,), the physical values of an action, for a planner tick."""
         self.data.ctrl[:] = target
 
+    def damp(self) -> None:
+        """Switch the actuators off until the next episode, except for their damping."""
+        self.model.actuator_gainprm[:] = 0.0
+        self.model.actuator_biasprm[:, :2] = 0.0
+
     def depth(self) -> NDArray[np.uint16]:
         """(H, W) planar depth of the camera now, mm; 0 outside its range."""
         position = self.data.cam_xpos[self._camera]

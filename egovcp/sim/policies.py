@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.env import BaseVectorEnv
+from egovcp.sim.base_env import BaseVectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task
 from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect

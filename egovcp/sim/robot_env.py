@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import SimulationDiverged
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.env import BaseVectorEnv, Observation, StepResult, VectorEnv, one_robot
+from egovcp.sim.base_env import BaseInstance, BaseVectorEnv, Observation, StepResult, one_robot
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.mujoco_robot import Array, MujocoRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task
@@ -55,7 +56,7 @@ def robot_class(task: str) -> type[MujocoRobot]:
     return kind.robot_class
 
 
-class RobotInstance:
+class RobotInstance(BaseInstance):
     """One robot in one episode at a time; all randomness comes from the scenario."""
 
     def __init__(self, config: EnvConfig, scenario: Scenario, render_depth: bool) -> None:
@@ -100,36 +101,10 @@ class RobotInstance:
         self.robot.forward()
         self._sense()
 
-    def end_tick(self, action: Array) -> dict[str, float]:
-        """Close the planner tick in which ``action`` (A,) was sent: reward terms and flags."""
-        if self.done:
-            return {}
-        self.tick += 1
-        terms = self.task.end_tick(action)
-        self.terminated = self.task.fallen
-        self.truncated = not self.terminated and self.task.is_over
-        return terms
-
     def _sense(self) -> None:
         self.state = np.asarray(self.robot.state(), np.float64)
         shape = self.robot.spec.depth
         self.depth = self.robot.depth() if self._renders else np.zeros(shape, np.uint16)
-
-    @property
-    def done(self) -> bool:
-        """Whether the episode has ended; physics then stands still."""
-        return self.terminated or self.truncated
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The sampled parameters of this episode; ``event_tick`` is -1 without an event."""
-        event = self.task.event_tick
-        return {**self.task.parameters, "event_tick": -1 if event is None else event}
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """What datasets record of the scenario."""
-        return {"event_tick": self.task.event_tick, "scene": self.task.parameters}
 
     @property
     def base_pose(self) -> Array:

@@ -13,7 +13,8 @@ import pytest
 from egovcp.log.mcap_reader import read_recording
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.rate import LockstepClock
-from egovcp.sim.env import Observation, StepResult, VectorEnv
+from egovcp.sim.base_env import Observation, StepResult
+from egovcp.sim.env import VectorEnv
 from egovcp.spec import ACTION_DIM, STATE_DIM
 from egovcp.testing import toy_model
 from egovcp_deploy.deploy import main as deploy

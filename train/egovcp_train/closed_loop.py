@@ -17,7 +17,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.plan.policy import Policy
 
 if TYPE_CHECKING:
-    from egovcp.sim.env import BaseVectorEnv
+    from egovcp.sim.base_env import BaseVectorEnv
     from egovcp.sim.scenario import Scenario
 
 VALIDATION: Final = 3_000_000_000  # scenarios of neither a collection nor of egovcp-eval
@@ -90,7 +90,7 @@ def _play(env: BaseVectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> 
 def _named(controller_id: str, tasks: Sequence[str]) -> str:
     """The name of the shipped controller of the G1 with this id; another robot has its own."""
     from egovcp.robot.controllers import STANCE, WALK, make_controller
-    from egovcp.sim.env import one_robot
+    from egovcp.sim.base_env import one_robot
 
     if not one_robot(tasks).is_g1:
         return WALK

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import BasePose, CameraView, SceneObject
+from egovcp.sim.base_env import BaseVectorEnv, Observation
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import BaseVectorEnv, Observation
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.tasks.base import Solid
 from egovcp.sim.tasks.registry import find_task

@@ -147,9 +147,9 @@ class BaseTask(ABC):
     def oracle(self) -> Array:
         """(A,) action of the scripted solution, which may use the whole state of the simulator.
 
-        Optional.
+        Optional; see `has_oracle`.
         """
-        raise NotImplementedError
+        raise self.error("it has no oracle")
 
     def park(self) -> None:  # noqa: B027 - optional
         """Move the objects out of sight and reach; see `in_sequence`."""

@@ -12,11 +12,11 @@ import sys
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import metadata
 from typing import TYPE_CHECKING, Any, Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
-from egovcp.packages import SIMULATOR_MODULES, is_installed, require_packages
+from egovcp.packages import SIMULATOR_MODULES, import_class, is_installed, require_packages
 from egovcp.spec import ACTION_TERMS, REWARD_TERMS
 from egovcp.terminal import echo
 
@@ -114,17 +114,9 @@ def _add(name: str, origin: str, reference: str) -> TaskEntry:
 
 
 def _load(reference: str) -> type[BaseTask]:
-    module, colon, name = reference.partition(":")
-    if not (module and colon and name):
-        raise ValueError(f"{reference!r} is no reference; expected package.module:Class")
     from egovcp.sim.tasks.base_task import BaseTask
 
-    found: Any = import_module(module)
-    for part in name.split("."):
-        found = getattr(found, part)
-    if not (isinstance(found, type) and issubclass(found, BaseTask)):
-        raise ValueError(f"{reference} is no subclass of Task or RobotTask of egovcp.sim.tasks")
-    return found
+    return import_class(reference, BaseTask, "Task or RobotTask of egovcp.sim.tasks")  # type: ignore[type-abstract]
 
 
 def _check(task: type[BaseTask]) -> None:

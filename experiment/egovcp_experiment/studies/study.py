@@ -22,8 +22,9 @@ from egovcp.model import Carry, WorldModel
 from egovcp.plan import PolicyStep
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.robot.controllers import make_controller
+from egovcp.sim.base_env import Observation, StepResult
 from egovcp.sim.config import EnvConfig, evaluation_config
-from egovcp.sim.env import Observation, PrivilegedState, StepResult, VectorEnv
+from egovcp.sim.env import PrivilegedState, VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_experiment.cell import RESULT

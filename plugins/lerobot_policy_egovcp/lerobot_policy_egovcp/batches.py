@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
+from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.data.privileged import mirror_privileged, privileged_features
 from egovcp.data.source import read_source
 from egovcp.errors import DataError, UsageError
 from egovcp.model import Batch
+from egovcp.robot_spec import G1
 
 _COLUMNS = (
     *(spec.REWARD_KEY, spec.REWARD_TERMS_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY),
@@ -214,16 +215,17 @@ def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:
 def mirrored(rows: Batch, which: Tensor) -> Batch:
     """The batch with the windows ``which`` (B,) bool mirrored left to right."""
 
-    def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
-        other = value[..., torch.from_numpy(source).to(value.device)]
-        other = other * torch.from_numpy(sign).to(value)
+    def swap(value: Tensor, source: Sequence[int], sign: Sequence[float]) -> Tensor:
+        other = value[..., list(source)] * torch.tensor(sign).to(value)
         return torch.where(which[:, None, None], other, value)
 
-    signs = mirror_privileged(np.ones(rows.privileged.shape[-1], np.float32))
+    robot = G1.mirror
+    assert robot is not None, "the G1 is symmetric"
+    signs = mirror_privileged(np.ones(rows.privileged.shape[-1], np.float32)).tolist()
     return rows._replace(
         depth=torch.where(which[:, None, None, None], rows.depth.flip(-1), rows.depth),
-        privileged=swap(rows.privileged, np.arange(len(signs)), signs),
-        state=swap(rows.state, mirror.STATE_SOURCE, mirror.STATE_SIGN),
-        action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
-        prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
+        privileged=swap(rows.privileged, range(len(signs)), signs),
+        state=swap(rows.state, robot.state_source, robot.state_sign),
+        action=swap(rows.action, robot.action_source, robot.action_sign),
+        prev_action=swap(rows.prev_action, robot.action_source, robot.action_sign),
     )

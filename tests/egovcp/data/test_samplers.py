@@ -22,10 +22,10 @@ from egovcp.data import (
     StreamingSampler,
 )
 from egovcp.data.index import in_split
-from egovcp.data.mirror import mirror_action, mirror_state
 from egovcp.data.privileged import privileged_features
 from egovcp.data.samplers import PrefetchIterator
 from egovcp.errors import DataError, UsageError
+from egovcp.robot_spec import G1
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +127,9 @@ def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
     flipped = (a["depth"] != b["depth"]).any(axis=(1, 2, 3))
     assert 10 < flipped.sum() < 54
     np.testing.assert_array_equal(b["depth"][flipped], a["depth"][flipped][..., ::-1])
-    np.testing.assert_array_equal(b["state"][flipped], mirror_state(a["state"][flipped]))
+    np.testing.assert_array_equal(b["state"][flipped], G1.mirrored_state(a["state"][flipped]))
     for name in ("action", "prev_action"):
-        np.testing.assert_array_equal(b[name][flipped], mirror_action(a[name][flipped]))
+        np.testing.assert_array_equal(b[name][flipped], G1.mirrored_action(a[name][flipped]))
     np.testing.assert_array_equal(a["mc_return"], b["mc_return"])
 
 

@@ -10,8 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from egovcp.errors import UsageError
+from egovcp.sim.base_env import StepResult
 from egovcp.sim.config import DelayConfig, EnvConfig, EpisodeConfig
-from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.gym import EgovcpEnv, register
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario

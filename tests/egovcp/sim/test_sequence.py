@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
+from egovcp.sim.base_env import StepResult
 from egovcp.sim.config import EnvConfig, EpisodeConfig
-from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import EnvPolicy, Hold, Oracle
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HEAD

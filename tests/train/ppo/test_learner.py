@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.reactive import ReactiveConfig
+from egovcp.sim.base_env import Observation, StepResult
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import Observation, StepResult
 from egovcp.sim.scenario import Scenario
 from egovcp_train.ppo.config import PpoTrainConfig
 from egovcp_train.ppo.learner import ContactEnv, ContactLearner

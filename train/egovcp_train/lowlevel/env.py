@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
-from egovcp.data.mirror import STATE_SIGN, STATE_SOURCE
 from egovcp.robot.arms import DT
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig
+from egovcp.robot_spec import G1
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, STATE_DIM, STATE_SLICES
@@ -262,15 +262,18 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
 
 
 # --- mirror images -------------------------------------------------------------------
+assert G1.mirror is not None
+_STATE_SOURCE: Final = np.array(G1.mirror.state_source)
+_STATE_SIGN: Final = np.array(G1.mirror.state_sign)
 _JOINTS = STATE_SLICES["joint_position"]
-_ACTION_SOURCE: Final = np.array(STATE_SOURCE[_JOINTS][:ACTIONS] - _JOINTS.start)
-_ACTION_SIGN: Final = STATE_SIGN[_JOINTS][:ACTIONS]
+_ACTION_SOURCE: Final = np.array(_STATE_SOURCE[_JOINTS][:ACTIONS] - _JOINTS.start)
+_ACTION_SIGN: Final = _STATE_SIGN[_JOINTS][:ACTIONS]
 #: Half a stride later the other foot swings: sin and cos change sign.
 _POLICY_SOURCE: Final = np.concatenate(
-    [STATE_SOURCE, STATE_DIM + np.arange(6), STATE_DIM + 6 + _ACTION_SOURCE]
+    [_STATE_SOURCE, STATE_DIM + np.arange(6), STATE_DIM + 6 + _ACTION_SOURCE]
 )
 _POLICY_SIGN: Final = np.concatenate(
-    [STATE_SIGN, [-1.0, -1.0, 1.0], [1.0, -1.0, -1.0], _ACTION_SIGN]
+    [_STATE_SIGN, [-1.0, -1.0, 1.0], [1.0, -1.0, -1.0], _ACTION_SIGN]
 )
 _PRIVILEGED_SOURCE: Final = np.array([0, 1, 2, 3, 4, 5, 6, 8, 7, 10, 9, 13, 14, 11, 12, 15, 16])
 _PRIVILEGED_SIGN: Final = np.array([1, -1, 1, -1, -1, 1, 1, 1, 1, 1, 1, 1, -1, 1, -1, 1, 1.0])

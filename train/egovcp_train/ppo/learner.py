@@ -18,8 +18,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from egovcp.reactive import KERNELS, STRIDES, FrameStack, ReactiveConfig, ReactiveNetwork
+from egovcp.sim.base_env import Observation
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_train.on_policy import Log, OnPolicyLearner, rsl_rl_config
