@@ -11,16 +11,19 @@ import torch
 from egovcp import spec
 from egovcp.data import EpisodeIndex, EpisodeStore, open_dataset
 from egovcp.model import WorldModel
+from egovcp.model.privileged_value import PrivilegedValue
+from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 from egovcp_train import privileged_value
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import PrivilegedValueConfig
-from egovcp_train.privileged_value import PrivilegedRows
+from egovcp_train.privileged_value import Transitions
 from egovcp_train.train import main
 
 type Arguments = Callable[..., list[str]]
 
-_CONFIG = PrivilegedValueConfig(updates=300, rows=128, lr=3e-3)
+_CONFIG = PrivilegedValueConfig(updates=300, rows=64, lr=3e-3)
+_PLANNER = PlannerConfig()
 
 
 @pytest.fixture
@@ -28,47 +31,91 @@ def store(dataset_root: Path) -> EpisodeStore:
     return EpisodeStore.read(EpisodeIndex.of([open_dataset(dataset_root)]))
 
 
-def _labelled(store: EpisodeStore) -> EpisodeStore:
-    """The return is the height of the object minus the commanded height; both mirror to
+def _rewarded(store: EpisodeStore) -> EpisodeStore:
+    """The reward is the height of the object minus the commanded height; both mirror to
     themselves."""
     height = store.privileged[:, 2] - store.action[:, 6]
     store.privileged[:, spec.OBJECT_KNOWN] = 1.0
     return dataclasses.replace(
         store,
         state=np.zeros_like(store.state),
-        mc_return=height.astype(np.float32),
-        mc_valid=np.ones(store.num_frames, np.bool_),
+        reward=height.astype(np.float32),
+        terminal_next=np.zeros(store.num_frames, np.bool_),
     )
 
 
-def _model() -> WorldModel:
+def _model(gamma: float = 0.0) -> WorldModel:
     model = toy_model()
     model.return_mean.fill_(0.0)
     model.return_std.fill_(1.0)
+    model.discount.fill_(gamma)
     return model
 
 
-def test_it_explains_returns_of_the_object_and_the_action(store: EpisodeStore) -> None:
-    store, model = _labelled(store), _model()
-    rows = PrivilegedRows(model, store)
-    value = privileged_value.fit(model, store, _CONFIG, seed=0)
-    assert min(rows.explained(value).values()) > 0.9
+def _changes(value: PrivilegedValue, rows: Transitions, column: int, by: float) -> torch.Tensor:
+    """Change of the value of some rows if one action is changed."""
     state, features, action = (x[:50] for x in rows.inputs)
-    raised = action.clone()
-    raised[:, 6] += 0.3
-    change = value(state, features, raised) - value(state, features, action)
-    assert float(change.mean()) == pytest.approx(-0.3, abs=0.1)
-    nothing = privileged_value.fit(model, store, PrivilegedValueConfig(1, 8, 1e-9), seed=0)
-    assert max(rows.explained(nothing).values()) < 0.1
+    other = action.clone()
+    other[:, column] += by
+    return value(state, features, other) - value(state, features, action)
+
+
+def test_without_a_future_it_is_the_reward_of_object_and_action(store: EpisodeStore) -> None:
+    store, model = _rewarded(store), _model()
+    value = privileged_value.fit(model, store, _CONFIG, _PLANNER, seed=0)
+    rows = Transitions(model, store)
+    reward = value(*rows.inputs)
+    assert float((reward - rows.reward).square().mean() / rows.reward.var()) < 0.1
+    assert float(_changes(value, rows, 6, 0.3).mean()) == pytest.approx(-0.3, abs=0.1)
+
+
+def test_next_actions_are_those_of_the_planner(store: EpisodeStore) -> None:
+    """The next reward is the planned height, so Q is higher than with the recorded actions."""
+    store = _rewarded(store)
+    store = dataclasses.replace(store, reward=-store.action[:, 6])
+    inputs = Transitions(_model(), store).inputs
+    previous = torch.zeros(len(inputs.action), 7)
+
+    class Lower(PrivilegedValue):
+        def forward(
+            self, state: torch.Tensor, privileged: torch.Tensor, action: torch.Tensor
+        ) -> torch.Tensor:
+            return -action[..., 6]
+
+    value = Lower(inputs.features.shape[-1])
+    generator = torch.Generator().manual_seed(0)
+
+    def planned(planner: PlannerConfig) -> torch.Tensor:
+        return privileged_value._planned_value(
+            _model(), value, inputs, previous, planner, generator
+        )
+
+    free = planned(PlannerConfig(pose_cost=0.0, action_rate_cost=0.0))
+    assert float(free.min()) > 0.0
+    assert float(free.max()) <= spec.ACTION_RATE_LIMIT + 1e-6
+    assert float(free.mean()) > 0.7 * spec.ACTION_RATE_LIMIT
+    assert not planned(PlannerConfig(pose_cost=0.0, action_rate_cost=1e6)).any()  # it holds
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_after_a_failure_nothing_is_expected(store: EpisodeStore, failed: bool) -> None:
+    store = _rewarded(store)
+    ones = np.ones(store.num_frames, np.float32)
+    ended = np.full(store.num_frames, failed)
+    store = dataclasses.replace(store, reward=ones, terminal_next=ended)
+    config = PrivilegedValueConfig(updates=150, rows=32, lr=3e-3)
+    value = privileged_value.fit(_model(0.5), store, config, _PLANNER, seed=0)
+    expected = value(*Transitions(_model(), store).inputs).mean()
+    assert float(expected) == pytest.approx(1.0 if failed else 2.0, abs=0.1)
 
 
 def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: EpisodeStore) -> None:
-    model, config = _model(), PrivilegedValueConfig(updates=3, rows=16)
+    model, config = _model(0.9), PrivilegedValueConfig(updates=3, rows=16)
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
     first, second, other = (
-        privileged_value.fit(model, _labelled(store), config, seed).state_dict()
+        privileged_value.fit(model, _rewarded(store), config, _PLANNER, seed).state_dict()
         for seed in (0, 0, 1)
     )
     assert torch.equal(torch.rand(3), expected)
@@ -76,11 +123,18 @@ def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: Episode
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_half_of_the_rows_are_mirrored(store: EpisodeStore) -> None:
-    rows = PrivilegedRows(_model(), _labelled(store))
-    (_, _, action), _ = rows.sample(4000, torch.Generator().manual_seed(0))
-    own = (action[:, None] == rows.inputs[2][None]).all(-1).any(1)
+def test_rows_are_followed_by_their_next_row_and_half_are_mirrored(store: EpisodeStore) -> None:
+    store = dataclasses.replace(_rewarded(store), reward=np.arange(store.num_frames, dtype="f4"))
+    rows = Transitions(_model(), store)
+    now, reward, then, failed = rows.sample(4000, torch.Generator().manual_seed(0))
+    index = reward.long()
+    own = (now.action == rows.inputs.action[index]).all(-1)
+    assert torch.equal(now.action[~own], rows.mirrored.action[index[~own]])
     assert float(own.float().mean()) == pytest.approx(0.5, abs=0.05)
+    assert torch.equal(then.action[own], rows.inputs.action[index[own] + 1])
+    assert torch.equal(then.action[~own], rows.mirrored.action[index[~own] + 1])
+    assert not failed.any()
+    assert not np.isin(index.numpy(), store.start + store.length - 1).any()
 
 
 def test_every_dataset_must_know_its_objects(store: EpisodeStore) -> None:
@@ -99,10 +153,10 @@ def test_a_run_fits_it_once_and_keeps_it(
 ) -> None:
     run = tmp_path / "run"
     assert main(arguments(run, steps=2, loading__mode=mode)) == 0
-    assert "the privileged value explains" in capsys.readouterr().out
+    assert "privileged value: correlation" in capsys.readouterr().out
     before = load_training_state(run)["learner"]["privileged_value"]
     assert main([f"--output_dir={run}", "--resume", "--steps=4"]) == 0
-    assert "the privileged value explains" not in capsys.readouterr().out
+    assert "privileged value: correlation" not in capsys.readouterr().out
     after = load_training_state(run)["learner"]["privileged_value"]
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)

@@ -25,7 +25,7 @@ from egovcp_train.records import WandbConfig
 class PrivilegedValueConfig:
     """Fit of the target of Q, see `egovcp_train.privileged_value`."""
 
-    updates: int = bounded(6000, least=1, most=10_000_000)
+    updates: int = bounded(10_000, least=1, most=10_000_000)
     """Updates before the training of the world model."""
     rows: int = bounded(512, least=1, most=1_000_000)
     """Rows of an update."""
@@ -232,7 +232,8 @@ def default() -> TrainConfig:
 
 def laptop() -> TrainConfig:
     """The default, ended by the clock; the recipe of `make quickstart`."""
-    return replace(default(), preset="laptop", max_minutes=9.5)
+    optimizer = OptimizerConfig(privileged_value=PrivilegedValueConfig(updates=3000))
+    return replace(default(), preset="laptop", max_minutes=9.5, optimizer=optimizer)
 
 
 def debug() -> TrainConfig:

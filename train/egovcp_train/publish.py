@@ -38,15 +38,16 @@ CURVES: Final = f"{ASSETS}/training.png"
 _PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "numpy")
 #: Prefix of a metric's name -> its meaning; the longest prefix applies.
 _METRICS: Final = {
-    "value/r2": "share of the variance of the Monte Carlo return that Q explains",
-    "value/slope": "regression of the return on Q; 1 is calibrated",
+    "value/r2": "share of the variance of its target that Q explains",
+    "value/slope": "regression of the target on Q; 1 is calibrated",
+    "value/ranking": "correlation of the advantages of actions by Q and by its target",
     "latent/active": "dimensions of z that carry information",
     "latent/kl": "KL divergence of posterior and prior, nats per step",
 }
 #: Title of a panel -> label of a curve -> scalar.
 _PANELS: Final[Mapping[str, Mapping[str, str]]] = {
     "loss": {"total": "loss/total"},
-    "Q on held-out episodes": {"R²": "heldout/value/r2", "slope": "heldout/value/slope"},
+    "Q on held-out episodes": {"R²": "heldout/value/r2", "ranking": "heldout/value/ranking"},
 }
 
 type Series = tuple[list[int], list[float]]

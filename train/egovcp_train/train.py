@@ -115,7 +115,7 @@ def train(config: TrainConfig) -> None:
         spent = _restore(output, learner, data)
     else:
         start = time.monotonic()
-        learner.privileged_value = privileged_value.prepare(learner.model, data, group)
+        learner.privileged_value = privileged_value.prepare(learner.model, data, group, bf16)
         spent = time.monotonic() - start  # it is part of --max_minutes
     provenance = _provenance(data)
     simulation = None
@@ -250,7 +250,8 @@ class TrainingRun:
     def measure(self, model: WorldModel) -> HeldoutReport:
         """Measure a model on held-out episodes, and in simulation if configured."""
         heldout = self.data.heldout
-        report = measure(model, episode_batches(heldout, self.device, EVALUATION_EPISODES))
+        episodes = episode_batches(heldout, self.device, EVALUATION_EPISODES)
+        report = measure(model, episodes, critic=self.learner.privileged_value)
         self.metrics, self.tasks = report.metrics, report.tasks
         if self.simulation is not None:
             self.played = self.simulation.play(model, self.config.planner)

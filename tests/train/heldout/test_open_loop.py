@@ -225,7 +225,7 @@ def test_pictures_show_their_content() -> None:
     assert pictures[0].dtype == np.uint8
     assert pictures[0].shape == (*pictures[1].shape[:2], 3)
     assert (pictures[0] != pictures[1]).any(-1).mean() > 0.2
-    values = Values(torch.randn(50), torch.randn(50))
+    values = Values(torch.randn(50, 1), torch.randn(50, 1))
     some = calibration_picture(values, {"slope": 1.0, "r2": 0.5, "bias": 0.0})
     flat = calibration_picture(values, {"slope": None, "r2": 0.5, "bias": 0.0})
     assert (some != flat).any()

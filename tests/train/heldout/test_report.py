@@ -14,6 +14,7 @@ from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import evenly_spaced
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
 from egovcp.model.losses import filter_sequence
+from egovcp.model.privileged_value import PrivilegedValue
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.heldout import report
 from egovcp_train.heldout.pictures import table
@@ -24,6 +25,7 @@ from egovcp_train.heldout.report import (
     calibration,
     episode_batches,
     measure,
+    ranking,
     scalars,
     termination_rows,
     termination_scores,
@@ -111,7 +113,34 @@ def test_slope_bias_and_r2_are_those_of_a_polynomial_fit() -> None:
     assert found["slope"] == pytest.approx(slope)
     assert found["bias"] == pytest.approx(value.mean() - target.mean())
     assert found["r2"] == pytest.approx(1 - ((value - target) ** 2).mean() / target.var())
+    assert found["correlation"] == pytest.approx(np.corrcoef(value, target)[0, 1])
     assert found["rows"] == 500
+
+
+def test_the_ranking_ignores_what_does_not_depend_on_the_action() -> None:
+    rng = torch.Generator().manual_seed(0)
+    target, of_state = (torch.randn(200, n, generator=rng) for n in (8, 1))
+    assert ranking(3.0 * target + 5.0 * of_state, target) == pytest.approx(1.0)
+    assert ranking(-target, target + of_state) == pytest.approx(-1.0)
+    assert abs(ranking(torch.randn(200, 8, generator=rng), target) or 1.0) < 0.1
+    assert ranking(of_state.expand(-1, 8), target) is None
+
+
+def test_in_training_q_is_compared_with_the_privileged_value() -> None:
+    class FirstCoordinate(PrivilegedValue):
+        def forward(self, state: Tensor, privileged: Tensor, action: Tensor) -> Tensor:
+            return action[..., 0] + privileged[..., 0]
+
+    model, (batch,) = _oracle(), _batches(1)
+    model.return_mean.fill_(0.0)
+    model.return_std.fill_(1.0)
+    batch.mc_valid[:] = False
+    critic = FirstCoordinate(batch.privileged.shape[-1])
+    found = measure(model, [EpisodeBatch("ball", batch)], critic=critic)
+    assert found.metrics["value/ranking"] == pytest.approx(1.0)
+    assert found.metrics["value/r2"] < 0.9  # Q does not see the features
+    assert found.tasks["ball"]["value"]["rows"] == batch.valid.sum()
+    assert "ranking 1.000" in table(found.tasks)
 
 
 def test_a_perfect_q() -> None:

@@ -62,12 +62,20 @@ def _block(task: str, report: Mapping[str, Any]) -> str:
         [
             *lines,
             f"termination AUC  {', '.join(aucs)} rows",
-            f"Q  slope {_number(value['slope'], 2)}, R2 {_number(value['r2'], 3)}, "
-            f"bias {_number(value['bias'], 3)} on {value['rows']} rows",
+            _value(value),
             f"latent  {latent['active']} of {latent['dimensions']} dimensions active, "
             f"KL {latent['kl_nats']:.2f} nats",
         ]
     )
+
+
+def _value(found: Mapping[str, Any]) -> str:
+    ranked = "ranking" in found
+    target = "privileged value" if ranked else "return"
+    kinds = (("correlation", 3), ("R2", 3), ("slope", 2), ("bias", 3))
+    parts = [f"{name} {_number(found[name.lower()], digits)}" for name, digits in kinds]
+    parts += [f"ranking {_number(found['ranking'], 3)}"] if ranked else []
+    return f"Q and {target}  {', '.join(parts)} on {found['rows']} rows"
 
 
 def _line(name: str, cells: Iterable[str]) -> str:
@@ -111,17 +119,17 @@ def strip_picture(strips: Sequence[Strip]) -> Image:
 
 
 def calibration_picture(values: Values, found: dict[str, Any]) -> Image:
-    """Q against the Monte Carlo return, with the diagonal and the regression."""
+    """Q against its target, with the diagonal and the regression."""
     pick = np.linspace(0, len(values.value) - 1, min(_POINTS, len(values.value))).astype(int)
-    q, target = values.value.numpy()[pick], values.target.numpy()[pick]
+    q, target = values.value[:, 0].numpy()[pick], values.target[:, 0].numpy()[pick]
     figure, axes = _figure(5.0, 5.0)
     axes.scatter(q, target, s=3, alpha=0.3, color="#7570b3", linewidths=0)
-    middle = float(values.value.mean()), float(values.target.mean())
+    middle = float(values.value[:, 0].mean()), float(values.target[:, 0].mean())
     axes.axline((0.0, 0.0), slope=1, color="#8a8f98", lw=1)
     if found["slope"] is not None:
         axes.axline(middle, slope=found["slope"], color="#d95f02", lw=1.5)
     words = [f"{k} {found[k]:.3f}" for k in ("slope", "r2", "bias") if found[k] is not None]
-    axes.set(xlabel="Q", ylabel="Monte Carlo return", title=", ".join(words))
+    axes.set(xlabel="Q", ylabel="target of Q", title=", ".join(words))
     return _pixels(figure)
 
 

@@ -14,14 +14,17 @@ from egovcp.data import EpisodeStore
 from egovcp.data.index import evenly_spaced
 from egovcp.data.store import gather
 from egovcp.errors import DataError
-from egovcp.model import Batch, WorldModel
+from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.latent_state import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
+from egovcp.model.privileged_value import PrivilegedValue, sample_actions
+from egovcp.model.value_losses import privileged_targets
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.datasets import to_tensors
 from egovcp_train.heldout.open_loop import OpenLoop, Strip, most_interesting, strips
 
 EPISODES_AT_ONCE: Final = 16
+RANKED_ACTIONS: Final = 16
 OPEN_LOOP_EPISODES: Final = 64
 """Of each task, for open-loop predictions, which take most of the time."""
 ACTIVE_NATS: Final = 0.01  # KL below which a latent dimension carries no information
@@ -63,15 +66,15 @@ def episode_batches(
 
 # --- calibration of Q ----------------------------------------------------------------
 def calibration(value: Tensor, target: Tensor) -> dict[str, float | int | None]:
-    """Q against the Monte Carlo return, (n,) each.
+    """Q against its target, (n,) each.
 
     Returns:
-        rows; bias, mean of Q - return; r2, share of the return's variance that Q explains (below 0
-        if the mean is a better prediction); slope, regression of the return on Q (1: calibrated,
-        above 1: Q varies too little). None where rows or variance are missing.
+        rows; bias, mean of Q - target; correlation; r2, share of the target's variance that Q
+        explains (below 0 if the mean is a better prediction); slope, regression of the target on Q
+        (1: calibrated, above 1: Q varies too little). None where rows or variance are missing.
     """
     out: dict[str, float | int | None] = {"rows": target.numel(), "bias": None}
-    out |= {"r2": None, "slope": None}
+    out |= {"correlation": None, "r2": None, "slope": None}
     if target.numel() == 0:
         return out
     value, target = value.double(), target.double()
@@ -82,7 +85,25 @@ def calibration(value: Tensor, target: Tensor) -> dict[str, float | int | None]:
     centred = value - value.mean()
     if float(centred.square().mean()) > _FLAT:
         out["slope"] = float((centred * target).mean() / centred.square().mean())
+        if variance > _FLAT:
+            both = torch.stack([value, target])
+            out["correlation"] = float(torch.corrcoef(both)[0, 1])
     return out
+
+
+def ranking(value: Tensor, target: Tensor) -> float | None:
+    """Correlation of the advantages of K actions over their mean, by Q and by its target.
+
+    Args:
+        value: Q (n, K).
+        target: the same by the target of Q.
+
+    Returns:
+        None if either does not depend on the action.
+    """
+    a, b = (x.double() - x.double().mean(1, keepdim=True) for x in (value, target))
+    scale = float((a.square().mean() * b.square().mean()).sqrt())
+    return float((a * b).mean()) / scale if scale > _FLAT else None
 
 
 # --- termination ---------------------------------------------------------------------
@@ -150,24 +171,30 @@ def auc(score: Tensor, positive: Tensor) -> float | None:
 
 # --- report --------------------------------------------------------------------------
 class Values(NamedTuple):
-    """Q and return of the rows whose return is complete, (n,) each."""
+    """Q and its target at rows that have one, for the recorded action and K - 1 sampled ones."""
 
-    value: Tensor
-    target: Tensor
+    value: Tensor  # (n, K)
+    target: Tensor  # (n, K)
+
+    def measures(self) -> dict[str, float | int | None]:
+        """`calibration` for the recorded action, and `ranking` of several actions."""
+        found = calibration(self.value[:, 0], self.target[:, 0])
+        several = self.value.shape[1] > 1
+        return found | ({"ranking": ranking(*self)} if several else {})
 
 
 class HeldoutReport(NamedTuple):
     """All measurements."""
 
     metrics: dict[str, float]
-    """Over all tasks: value/r2, value/slope (see `calibration`), latent/kl (nats per row),
-    latent/active (dimensions of z that carry information) and object_rmse_m (see
+    """Over all tasks: value/r2, value/slope, value/ranking (see `Values`), latent/kl (nats per
+    row), latent/active (dimensions of z that carry information) and object_rmse_m (see
     `TaskMeasurements`)."""
     tasks: dict[str, dict[str, Any]]
     """Task -> episodes, rows, depth, state, termination, value, latent and object_rmse_m, which is
     None if it is unknown; JSON-able."""
     values: dict[str, Values]
-    """Task -> Q and returns, for pictures."""
+    """Task -> Q and its target, for pictures."""
     strips: dict[str, list[Strip]]
     """Task -> some open-loop predictions, for pictures."""
 
@@ -175,7 +202,10 @@ class HeldoutReport(NamedTuple):
 class TaskMeasurements:
     """Measurements of one task, summed over batches of its episodes."""
 
-    def __init__(self, stride: int, robot: RobotSpec = G1) -> None:
+    def __init__(
+        self, stride: int, robot: RobotSpec = G1, critic: PrivilegedValue | None = None
+    ) -> None:
+        self._critic = critic
         self.episodes = self.rows = 0
         self.open_loop = OpenLoop(stride, robot)
         self.termination: list[TerminationRows] = []
@@ -196,9 +226,7 @@ class TaskMeasurements:
             self.open_loop.add(model, batch, rollout)
             self.strips = most_interesting([*self.strips, *strips(model, batch, rollout)])
         self.termination.append(termination_rows(model, batch, rollout))
-        usable = batch.valid & batch.mc_valid
-        value = model.value(rollout.carry, batch.action)
-        self._values.append(Values(value[usable].cpu(), batch.mc_return[usable].cpu()))
+        self._values.append(self._compare(model, rollout.carry, batch))
         if model.object_head is not None:
             known = batch.valid & batch.object_known
             error = (model.object_position(rollout.carry) - batch.object[..., :3])[known]
@@ -207,9 +235,23 @@ class TaskMeasurements:
         kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid].double().sum(0).cpu()
         self.kl = kl + self.kl if len(self.kl) else kl
 
+    def _compare(self, model: WorldModel, carry: Carry, batch: Batch) -> Values:
+        """Q and its target."""
+        action = batch.action[:, :, None]
+        if self._critic is None:
+            target, usable = batch.mc_return[..., None], batch.valid & batch.mc_valid
+        else:
+            generator = torch.Generator(device=action.device).manual_seed(0)
+            others = sample_actions(batch.prev_action, RANKED_ACTIONS - 1, generator)
+            action = torch.cat([action, others], 2)
+            found = privileged_targets(model, batch, self._critic, action)
+            target, usable = found.value * model.return_std + model.return_mean, found.usable
+        value = model.value(carry.map(lambda x: x[:, :, None]), action)
+        return Values(value[usable].cpu(), target[usable].cpu())
+
     @property
     def values(self) -> Values:
-        """Q and returns of all batches."""
+        """Q and its target of all batches."""
         return Values(*(torch.cat(x) for x in zip(*self._values, strict=True)))
 
     def result(self) -> dict[str, Any]:
@@ -221,7 +263,7 @@ class TaskMeasurements:
             "depth": self.open_loop.depth(),
             "state": self.open_loop.state(),
             "termination": termination_scores(self.termination),
-            "value": calibration(*self.values),
+            "value": self.values.measures(),
             "latent": {
                 "active": int((kl > ACTIVE_NATS).sum()),
                 "dimensions": len(kl),
@@ -244,6 +286,7 @@ def measure(
     episodes: Iterable[EpisodeBatch],
     stride: int = 4,
     stopped: Callable[[], bool] = lambda: False,
+    critic: PrivilegedValue | None = None,
 ) -> HeldoutReport:
     """Measure a model.
 
@@ -252,6 +295,7 @@ def measure(
         episodes: batches of episodes.
         stride: rows between the starts of open-loop predictions.
         stopped: once it returns true, the remaining episodes are left out.
+        critic: the target of Q; None: the return of the data's actions.
 
     Raises:
         DataError: there are no episodes.
@@ -262,7 +306,9 @@ def measure(
     for task, batch, open_loop in episodes:
         if stopped():
             break
-        tasks.setdefault(task, TaskMeasurements(stride, model.robot)).add(model, batch, open_loop)
+        if task not in tasks:
+            tasks[task] = TaskMeasurements(stride, model.robot, critic)
+        tasks[task].add(model, batch, open_loop)
     if not tasks:
         if stopped():
             raise KeyboardInterrupt
@@ -278,13 +324,14 @@ def measure(
 
 def _over_all_tasks(tasks: list[TaskMeasurements], values: list[Values]) -> dict[str, float]:
     kl = torch.stack([task.kl for task in tasks]).sum(0) / sum(task.rows for task in tasks)
-    found = calibration(*(torch.cat(x) for x in zip(*values, strict=True)))
+    found = Values(*(torch.cat(x) for x in zip(*values, strict=True))).measures()
+    names = ("r2", "slope", "ranking")
     error = rmse(tasks)
     return {
         **({} if error is None else {"object_rmse_m": error}),
         "latent/kl": float(kl.sum()),
         "latent/active": float((kl > ACTIVE_NATS).sum()),
-        **{f"value/{name}": v for name in ("r2", "slope") if (v := found[name]) is not None},
+        **{f"value/{name}": v for name in names if (v := found.get(name)) is not None},
     }
 
 
@@ -302,8 +349,8 @@ def scalars(tasks: dict[str, dict[str, Any]]) -> dict[str, float]:
                     found[f"{task}/{kind}_{part}_repeat_h{k}"] = errors[repeat]
         for k, scores in report["termination"].items():
             found[f"{task}/termination_auc_{k}"] = scores["auc"]
-        for name in ("slope", "r2", "bias"):
-            found[f"{task}/value_{name}"] = report["value"][name]
+        for name in ("slope", "r2", "bias", "correlation", "ranking"):
+            found[f"{task}/value_{name}"] = report["value"].get(name)
         found[f"{task}/latent_active"] = report["latent"]["share"]
         found[f"{task}/object_rmse_m"] = report["object_rmse_m"]
     return {name: value for name, value in found.items() if value is not None}
