@@ -55,7 +55,7 @@ def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         [
             *_COMMAND,
             f"--dataset.root={tmp_path / 'cut'}",
-            "--episodes=100000",
+            "--episodes=10000",
             "--num_workers=1",
             "--worker_timeout=6",
         ],

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import traceback
 from collections import Counter
 from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -25,6 +28,8 @@ from .listing import ListedCommand, all_commands
 
 SECONDS = 30.0  # on a busy machine; what hangs takes for ever
 STANCE = "--env.controller=stance"
+#: Before and after the output of a command.
+_BEGIN, _END = "=== begin\n", "=== end "
 #: ListedCommand -> (its arguments, options that name an input, options that name an output).
 CASES = {
     "egovcp-collect": (
@@ -212,19 +217,36 @@ def test_a_bad_path_is_refused_before_work_starts(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     command = next(c for c in all_commands() if c.prog == prog)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)  # read at its import
-    before = _contents(places)
+    flags = list(map(_flag, bad))
+    given = [*command.arguments, *_arguments(arguments)]
+    # one child for all values: a fork takes longer than most commands
+    found = run_limited(lambda: _try_all(command, given, flags, places), SECONDS)
     problems = []
-    for flag, value in map(_flag, bad):
-        argv = [*command.arguments, *_arguments(arguments), f"{flag}={value}"]
-        found = run_limited(lambda argv=argv: command.main(argv), SECONDS)
-        if problem := _problem(command, flag, value, found):
+    for (flag, value), text in zip_longest(flags, found.output.split(_BEGIN)[1:], fillvalue=""):
+        if problem := _problem(command, flag, text, found):
             problems.append(f"{prog} {flag}={value[:60]!a}: {problem}")
-        if created := _contents(places) - before:
-            problems.append(f"{prog} {flag}={value[:60]!a}: created {created}")
-            for name in sorted(created, reverse=True):  # the next case starts as this one did
-                path = places / name
-                path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
     assert not problems, "\n".join(problems)
+
+
+def _try_all(
+    command: ListedCommand, given: list[str], flags: list[tuple[str, str]], folder: Path
+) -> int:
+    """Run a command with each of the flags; print what it prints, its exit code, and the files it
+    leaves behind, which are removed."""
+    before = _contents(folder)
+    for flag, value in flags:
+        print(_BEGIN, end="")
+        try:
+            code = command.main([*given, f"{flag}={value}"])
+        except BaseException:  # noqa: BLE001 - a traceback is a problem, whatever it is of
+            traceback.print_exc()
+            code = -1
+        created = _contents(folder) - before
+        for name in sorted(created, reverse=True):  # the next case starts as this one did
+            path = folder / name
+            path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+        print(f"{_END}{json.dumps([code, sorted(created)])}")
+    return 0
 
 
 def _arguments(text: str) -> list[str]:
@@ -244,13 +266,18 @@ def _flag(option_and_value: tuple[str, str]) -> tuple[str, str]:
     return f"--{option}", value
 
 
-def _problem(command: ListedCommand, flag: str, value: str, found: LimitedResult) -> str:
-    output = found.output.replace("\n", "\\n")[-600:]
-    if found.timed_out:
-        return f"took more than {SECONDS} s: {output}"
-    if found.has_traceback or not 2 <= found.exit_code <= 5:
-        return f"exit code {found.exit_code}: {output}"
-    errors = [line for line in found.output.splitlines() if ": error: " in line]
+def _problem(command: ListedCommand, flag: str, text: str, found: LimitedResult) -> str:
+    printed, _, end = text.partition(_END)
+    output = printed.replace("\n", "\\n")[-600:]
+    if not end:
+        why = f"took more than {SECONDS} s" if found.timed_out else f"ended {found.exit_code}"
+        return f"{why}: {output}"
+    exit_code, created = json.loads(end)
+    if "Traceback (most recent call last)" in printed or not 2 <= exit_code <= 5:
+        return f"exit code {exit_code}: {output}"
+    if created:
+        return f"created {created}"
+    errors = [line for line in printed.splitlines() if ": error: " in line]
     if len(errors) != 1 or not errors[0].isprintable():
         return f"expected one line: {output}"
     named = {f for f in re.findall(r"(?<![\w.-])--[a-z][\w.]*", errors[0]) if "`" not in errors[0]}

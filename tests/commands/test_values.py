@@ -88,8 +88,8 @@ def _problem(option: Option, value: str) -> str:
 
 
 def _values(option: Option, number: int) -> list[str]:
-    """Values for the option of this number; a quarter of them if many options are parsed alike."""
-    return VALUES[number % 4 :: 4] if option.kind in COMMON_KINDS else VALUES
+    """Values for the option of this number; a twelfth of them if many options are parsed alike."""
+    return VALUES[number % 12 :: 12] if option.kind in COMMON_KINDS else VALUES
 
 
 def test_every_option_takes_values_of_its_type_or_names_itself() -> None:

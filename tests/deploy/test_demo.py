@@ -49,6 +49,7 @@ def test_the_result_of_each_part_is_printed_and_the_rollout_recorded(
     ]
 
 
+@pytest.mark.slow
 def test_a_single_task_and_an_own_policy(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:

@@ -21,6 +21,8 @@ from egovcp_deploy.deploy import main
 from egovcp_deploy.robots.base import ActionResult
 from egovcp_deploy.robots.sim import SimRobot
 
+#: The recording alone; drawing it takes longer than the rollout.
+UNDRAWN = ("--log.rrd=false", "--log.videos=0")
 #: What ``auto`` may stand for.
 BACKENDS = ("float32", "int8")
 
@@ -66,7 +68,8 @@ def test_a_recording_has_the_format_of_the_data(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
-    run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short)
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}"]
+    run(*flags, *short, *UNDRAWN)
     ticks = read_recording(out / "rollout-0.mcap").ticks
     sent = np.array([tick.action_sent for tick in ticks])
     steps = np.diff(sent, axis=0, prepend=np.zeros((1, 7)))
@@ -132,7 +135,7 @@ def test_an_artifact_of_another_controller_is_refused(
 def test_each_event_of_an_episode_is_logged_once(tmp_path: Path, artifact_dir: Path) -> None:
     out = tmp_path / "out"
     flags = ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]", "--imagine=0"]
-    flags.append("--env.controller=stance")
+    flags += ["--env.controller=stance", *UNDRAWN]
     run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *flags)
     ticks = read_recording(out / "rollout-0.mcap").ticks
     events = [event for tick in ticks for event in tick.events]
@@ -151,7 +154,7 @@ def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None
     flags += ["--env.arch_episode.event_ticks=[2,2]", "--env.sequence.pause_ticks=5"]
     flags += ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]"]
     played = ["--task=sequence", "--controller=oracle", "--episodes=1", "--seed=3"]
-    assert run(*played, *flags, f"--output_dir={tmp_path / 'out'}") == 0
+    assert run(*played, *flags, *UNDRAWN, f"--output_dir={tmp_path / 'out'}") == 0
     ticks = read_recording(tmp_path / "out" / "rollout-0.mcap").ticks
     assert [event for tick in ticks for event in tick.events] == [
         "passage begins",
@@ -168,7 +171,7 @@ def test_a_reference_needs_no_artifact_and_logs_no_plan(
 ) -> None:
     out = tmp_path / "out"
     flags = ["--controller=oracle", "--episodes=1", "--seed=3", f"--output_dir={out}"]
-    assert run(*flags, *short) == 0, capsys.readouterr().err
+    assert run(*flags, *short, *UNDRAWN) == 0, capsys.readouterr().err
     ticks = read_recording(out / "rollout-0.mcap").ticks
     assert len(ticks) == 15
     assert all(t.plan is None and t.candidates is None and t.value is None for t in ticks)
@@ -180,7 +183,8 @@ def test_a_reference_needs_no_artifact_and_logs_no_plan(
 
 def test_the_environment_is_recorded(tmp_path: Path, artifact_dir: Path, short: list[str]) -> None:
     out = tmp_path / "out"
-    assert run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short) == 0
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}"]
+    assert run(*flags, *short, *UNDRAWN) == 0
     report = json.loads((out / "deploy.json").read_text())
     env = report["config"]["env"]
     assert env["wall"]["push_speed_range"] == list(EnvConfig().wall.push_speed_range)
@@ -192,7 +196,7 @@ def test_planner_options_change_the_planner(
 ) -> None:
     out = tmp_path / "out"
     flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}"]
-    assert run(*flags, "--planner.horizon=5", "--planner.elites=2", *short) == 0
+    assert run(*flags, "--planner.horizon=5", "--planner.elites=2", *short, *UNDRAWN) == 0
     tick = read_recording(out / "rollout-0.mcap").ticks[0]
     assert tick.plan is not None
     assert tick.plan.shape == (5, 7)
@@ -225,7 +229,8 @@ def test_an_interrupt_leaves_the_summary_of_complete_rollouts(
 ) -> None:
     interrupted_in(2)
     out = tmp_path / "out"
-    assert run("--controller=hold", "--episodes=4", f"--output_dir={out}", *short) == 130
+    flags = ["--controller=hold", "--episodes=4", f"--output_dir={out}"]
+    assert run(*flags, *short, *UNDRAWN) == 130
     report = json.loads((out / "deploy.json").read_text())
     assert [row["episode"] for row in report["rollouts"]] == [0, 1]
     assert report["config"]["episodes"] == 4
@@ -243,7 +248,7 @@ def test_an_interrupt_in_the_first_rollout_leaves_no_summary(
 ) -> None:
     interrupted_in(0)
     out = tmp_path / "out"
-    assert run("--controller=hold", f"--output_dir={out}", *short) == 130
+    assert run("--controller=hold", f"--output_dir={out}", *short, *UNDRAWN) == 130
     assert not (out / "deploy.json").exists()
 
 

@@ -31,20 +31,20 @@ MALFORMED = (
     *("state: remote control not base64", "state: quaternion zero"),
     "state: quaternion of length 2",
 )
-#: States that `PlausibilityFilter` rejects, as it does those with the gyroscope at 150 rad/s and
-#: those whose position jumps; see ``robots/test_plausibility.py``.
-IMPLAUSIBLE = (
-    *("gyroscope: 20 rad/s", "joint speed: 190 rad/s", "joint speed: 190 rad/s once"),
-    *("joint speed: 190 rad/s at 50 Hz", "joint speed: 25 rad/s", "joint speed: all +-190 rad/s"),
-    *("joint position: 9 rad", "torque: 900 N m", "torque: 900 N m once"),
-    *("orientation: jumps by 0.8 rad", "orientation: jumps by 0.8 rad once"),
+#: At least one fault of every source and with every reaction; the others only with ``-m slow``.
+ALWAYS = (
+    *("state: silent", "state: silent for 60 ms", "state: silent for 150 ms", "state: frozen"),
+    *("state: 30 % lost", "state: not JSON", "gyroscope: 150 rad/s", "mode machine: 5 to 6"),
+    *("joint position: jumps by 0.5 rad", "motor: winding at 125 deg C"),
+    *("motor: dropped, status disconnected", "flood: the same without states"),
+    *("connection: 20 kB/s", "connection: cut, port closed", "image: silent", "image: garbage"),
+    *("planner: silent", "planner: plans NaN", "remote control: emergency stop"),
+    *("operator: emergency stop", "operator: velocity NaN", "robot: pushed over"),
+    "control process: SIGKILL",
 )
 BY_NAME = {kind.name: kind for kind in FAULTS}
-#: The others are played only with ``-m slow``.
 PLAYED = [
-    pytest.param(
-        kind, id=name, marks=[pytest.mark.slow] if name in (*MALFORMED, *IMPLAUSIBLE) else []
-    )
+    pytest.param(kind, id=name, marks=[] if name in ALWAYS else [pytest.mark.slow])
     for name, kind in BY_NAME.items()
 ]
 
@@ -57,6 +57,7 @@ def rig() -> Iterator[FaultRig]:
 
 
 def test_there_are_at_least_60_faults() -> None:
+    assert set(ALWAYS) <= BY_NAME.keys()
     assert len({kind.name for kind in FAULTS}) == len(FAULTS) >= 60
 
 

@@ -50,8 +50,8 @@ def test_a_rollout_counts_skipped_observations(
     tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    flags = [f"--policy.path={artifact_dir}", "--episodes=1", "--log.rrd=false", *short]
-    assert deploy([*flags, f"--output_dir={out}"]) == 0
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short]
+    assert deploy([*flags, "--log.rrd=false", "--log.videos=0"]) == 0
     (row,) = json.loads((out / "deploy.json").read_text())["rollouts"]
     assert row["skipped_observations"] == 1
     assert row["rejected_plans"] == 0

@@ -54,6 +54,6 @@ def test_a_rollout_does_not_time_the_first_plan(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={tmp_path / 'out'}"]
-    assert deploy([*flags, "--log.rrd=false", *short]) == 0
+    assert deploy([*flags, "--log.rrd=false", "--log.videos=0", *short]) == 0
     (row,) = json.loads((tmp_path / "out" / "deploy.json").read_text())["rollouts"]
     assert row["plan_ms_p99"] == pytest.approx(1e3 * PLAN_S)

@@ -32,7 +32,7 @@ _TRAIN = shlex.split(
 _REDUCED = {
     "egovcp-collect": ["--episodes=1", "--num_workers=1", "--num_envs=1", *_SHORT],
     "egovcp-dataset": [],
-    "egovcp-deploy": ["--episodes=1", *_SHORT],
+    "egovcp-deploy": ["--episodes=1", "--log.videos=0", *_SHORT],
     "egovcp-eval": ["--episodes=1", "--num_workers=1", "--num_envs=1", *_SHORT],
     "egovcp-eval-model": ["--device=cpu", "--pictures=false"],
     "egovcp-mcap": [],

@@ -52,6 +52,7 @@ def run(
     return schedule
 
 
+@pytest.mark.slow
 def test_cells_run_in_order_and_a_failure_stops_only_the_cells_that_need_it(
     here: None, cell: MakeCell, tmp_path: Path, diary: Path
 ) -> None:

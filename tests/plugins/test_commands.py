@@ -112,6 +112,7 @@ def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) 
     assert policy.config.planner.samples == 16
 
 
+@pytest.mark.slow
 def test_what_it_publishes_is_the_artifact(
     hub: FakeHub, run: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

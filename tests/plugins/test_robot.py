@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partialmethod
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from egovcp import spec
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp_deploy.live.hardware import CameraOptions
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.robots.bridge import BridgeConfig
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from lerobot_robot_egovcp import EgovcpG1, EgovcpG1Config
 
@@ -84,7 +85,9 @@ def test_methods_before_connect_raise(robot: EgovcpG1) -> None:
             call()
 
 
-def test_no_robot_is_a_clear_failure(robot: EgovcpG1) -> None:
+def test_no_robot_is_a_clear_failure(robot: EgovcpG1, monkeypatch: pytest.MonkeyPatch) -> None:
+    impatient = partialmethod(BridgeRobot.connect, timeout=0.1)
+    monkeypatch.setattr(BridgeRobot, "connect", impatient)
     with pytest.raises(EnvironmentFailure, match="nothing at"):
         robot.connect()
     assert not robot.is_connected

@@ -45,7 +45,14 @@ def plain(tmp_path_factory: pytest.TempPathFactory, arguments: Arguments) -> Pat
     return output
 
 
-@pytest.mark.parametrize("options", [TD, ARWM, TD | ARWM | REWARD], ids=["td", "arwm", "all"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param(TD, id="td", marks=pytest.mark.slow),
+        pytest.param(ARWM, id="arwm", marks=pytest.mark.slow),
+        pytest.param(TD | ARWM | REWARD, id="all"),
+    ],
+)
 def test_a_stopped_variant_that_is_resumed_equals_an_uninterrupted_one(
     arguments: Arguments,
     plain: Path,

@@ -37,7 +37,7 @@ def test_the_recording_of_open_loop_prediction_lies_in_the_run(
     assert (tmp_path / "run" / "open_loop.rrd").read_bytes()[:4] == b"RRF2"
 
 
-@pytest.mark.parametrize("broken", ["record", "draw"])
+@pytest.mark.parametrize("broken", ["record", pytest.param("draw", marks=pytest.mark.slow)])
 def test_pictures_that_fail_do_not_take_the_finished_model_with_them(
     arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
 ) -> None:

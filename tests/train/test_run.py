@@ -134,7 +134,7 @@ def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_pa
 
 def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:
     output = tmp_path / "run"
-    assert main(arguments(output, steps=10**6, save_freq=10**6, max_minutes=0.1)) == 0
+    assert main(arguments(output, steps=10**6, save_freq=10**6, max_minutes=0.05)) == 0
     step = load_artifact(str(_last(output) / "pretrained_model")).manifest["step"]
     assert 0 < step < 10**6
 

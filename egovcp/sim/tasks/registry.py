@@ -70,9 +70,9 @@ def task_entries() -> tuple[TaskEntry, ...]:
     stderr, and stays in the list. Without the simulator there is none.
     """
     global _found
-    if not all(map(is_installed, SIMULATOR_MODULES)):
-        return ()
     if _found is None:
+        if not all(map(is_installed, SIMULATOR_MODULES)):
+            return ()
         _found = []  # a plugin may use the registry while it is imported
         for point in sorted(_points(), key=lambda p: (p.dist.name != "egovcp", p.dist.name)):
             _add(point.name, f"{point.dist.name} {point.dist.version}", point.value)

@@ -40,7 +40,9 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("more") / "two", [6, 7])
 
 
-@pytest.mark.parametrize("tool", [_delete, _split, _merge])
+@pytest.mark.parametrize(
+    "tool", [*(pytest.param(t, marks=pytest.mark.slow) for t in (_delete, _split)), _merge]
+)
 def test_results_of_lerobots_tools_load_and_can_be_repaired(
     tool: Tool, sound: Path, two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

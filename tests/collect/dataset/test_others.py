@@ -67,7 +67,13 @@ def test_coverage_names_constant_values(
     assert "action[0] (pan) is always 1: normalising divides" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        kind if kind in ("arm", "cameras") else pytest.param(kind, marks=pytest.mark.slow)
+        for kind in KINDS
+    ],
+)
 def test_delete_and_split_keep_every_frame(
     kind: str, others: dict[str, Path], tmp_path: Path
 ) -> None:
@@ -112,13 +118,18 @@ def test_impossible_edits_are_refused(
 @pytest.mark.parametrize(
     ("damage", "kept"),
     [
-        (d.info(total_frames=3), [0, 1, 2, 3]),
-        (d.statistic("action", "mean", [9.0, 9.0]), [0, 1, 2, 3]),
-        (of_table(length=lambda v: v.__setitem__(1, 15)), [0, 1, 2, 3]),
         (d.cut(d.EPISODES, 0.5), [0, 1, 2, 3]),
         (d.remove(d.TASKS), [0, 1, 2, 3]),
         (rows_of(d.DATA, timestamp=lambda v: v.__setitem__(12, 0.1)), [0, 2, 3]),
-        (rows_of(d.DATA, task_index=lambda v: v.__setitem__(12, 5)), [0, 2, 3]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                (d.info(total_frames=3), [0, 1, 2, 3]),
+                (d.statistic("action", "mean", [9.0, 9.0]), [0, 1, 2, 3]),
+                (of_table(length=lambda v: v.__setitem__(1, 15)), [0, 1, 2, 3]),
+                (rows_of(d.DATA, task_index=lambda v: v.__setitem__(12, 5)), [0, 2, 3]),
+            )
+        ),
     ],
 )  # fmt: skip
 def test_repair_keeps_what_is_sound(

@@ -132,22 +132,31 @@ def _content(root: Path) -> dict[Path, str]:
     [
         (lambda root: None, [0, 1, 2, 3, 4, 5], []),
         (d.remove(INFO), [0, 1, 2, 3, 4, 5], []),
-        (d.remove(STATS), [0, 1, 2, 3, 4, 5], []),
-        (d.remove(TASKS), [0, 1, 2, 3, 4, 5], []),
         (d.remove("meta/episodes"), [0, 1, 2, 3, 4, 5], []),
-        (d.cut(EPISODES, 0.5), [0, 1, 2, 3, 4, 5], []),
-        (d.info(data_path="../{chunk_index}"), [0, 1, 2, 3, 4, 5], []),
         (d.cut(DATA, 0.5), [3, 4, 5], [(DATA, 0), (DATA, 1), (DATA, 2)]),
-        (d.remove(MORE_DATA), [0, 1, 2], [(MORE_DATA, 3), (MORE_DATA, 4), (MORE_DATA, 5)]),
         (d.swap(DATA, MORE_DATA), [3, 4, 5, 0, 1, 2], []),
         (d.flip_pixel, [0, 2, 3, 4, 5], [(DATA, 1)]),
-        (d.column("next.reward", d.put(14, float("nan"))), [0, 2, 3, 4, 5], [(DATA, 1)]),
-        (d.column("timestamp", d.put(14, 9.0)), [0, 2, 3, 4, 5], [(DATA, 1)]),
         (d.column("episode_index", d.put(30, 7)), [0, 1, 3, 4, 5], [(DATA, 2), (DATA, 7)]),
-        (d.column(spec.DEPTH_KEY, d.blob(14, lambda b: None)), [0, 2, 3, 4, 5], [(DATA, 1)]),
         (d.record(1, sha256="0" * 64), [0, 2, 3, 4, 5], [(DATA, 1)]),
-        (d.record(1, task=""), [0, 2, 3, 4, 5], [(DATA, 1)]),
-        (d.outside(DATA), [3, 4, 5], [(DATA, 0), (DATA, 1), (DATA, 2)]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                (d.remove(STATS), [0, 1, 2, 3, 4, 5], []),
+                (d.remove(TASKS), [0, 1, 2, 3, 4, 5], []),
+                (d.cut(EPISODES, 0.5), [0, 1, 2, 3, 4, 5], []),
+                (d.info(data_path="../{chunk_index}"), [0, 1, 2, 3, 4, 5], []),
+                (d.remove(MORE_DATA), [0, 1, 2], [(MORE_DATA, 3), (MORE_DATA, 4), (MORE_DATA, 5)]),
+                (d.column("next.reward", d.put(14, float("nan"))), [0, 2, 3, 4, 5], [(DATA, 1)]),
+                (d.column("timestamp", d.put(14, 9.0)), [0, 2, 3, 4, 5], [(DATA, 1)]),
+                (
+                    d.column(spec.DEPTH_KEY, d.blob(14, lambda b: None)),
+                    [0, 2, 3, 4, 5],
+                    [(DATA, 1)],
+                ),
+                (d.record(1, task=""), [0, 2, 3, 4, 5], [(DATA, 1)]),
+                (d.outside(DATA), [3, 4, 5], [(DATA, 0), (DATA, 1), (DATA, 2)]),
+            )
+        ),
     ],
 )
 def test_repair_keeps_sound_episodes_and_lists_the_others(

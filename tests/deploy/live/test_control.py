@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
@@ -78,8 +79,14 @@ def test_the_robot_stands_and_reaches_the_planned_targets(make_rig: Make) -> Non
     assert_sane(rig.body.commands)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.02])
-@pytest.mark.parametrize("delay_ms", [10, 30, 90])
+@pytest.mark.parametrize(
+    ("delay_ms", "offset"),
+    [
+        (10, 0.02),
+        (90, 0.0),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in product((10, 30, 90), (0.0, 0.02))),
+    ],
+)
 def test_the_recurrence_begins_at_run_and_gets_the_sent_actions(
     make_rig: Make, delay_ms: int, offset: float
 ) -> None:
@@ -99,7 +106,9 @@ def test_the_recurrence_begins_at_run_and_gets_the_sent_actions(
     np.testing.assert_allclose(commands[1:, 3:], ACTION_BOX.to_metric(sent), atol=1e-6)
 
 
-@pytest.mark.parametrize("delay_ms", [5, 15, 30, 38])
+@pytest.mark.parametrize(
+    "delay_ms", [38, *(pytest.param(ms, marks=pytest.mark.slow) for ms in (5, 15, 30))]
+)
 def test_a_plan_that_is_ready_within_its_tick_is_never_missed(
     make_rig: Make, delay_ms: int
 ) -> None:
@@ -110,7 +119,9 @@ def test_a_plan_that_is_ready_within_its_tick_is_never_missed(
     assert set(rig.states[-100:]) == {State.RUN}
 
 
-@pytest.mark.parametrize("delay_ms", [60, 100, 200, 400])
+@pytest.mark.parametrize(
+    "delay_ms", [100, *(pytest.param(ms, marks=pytest.mark.slow) for ms in (60, 200, 400))]
+)
 def test_a_slow_planner_holds_the_robot_and_never_damps_it(make_rig: Make, delay_ms: int) -> None:
     slow = [False]
     rig = make_rig(lambda tick: delay_ms if slow[0] else 10)
@@ -223,7 +234,9 @@ def test_targets_that_are_not_finite_damp_in_the_same_tick(
     assert_sane(rig.body.commands)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_targets_stay_in_bounds_for_any_network_output(
     make_rig: Make, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:

@@ -101,7 +101,7 @@ def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Call
         command = [
             *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
             *(f"--policy.path={artifact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
-            "--robot.controller=stance",
+            *("--robot.controller=stance", "--log.videos=0"),
             f"--robot.bridge.state_port={ports.state_port}",
             f"--robot.bridge.command_port={ports.command_port}",
             f"--robot.camera.server.port={ports.camera_port}",
@@ -130,7 +130,7 @@ def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Call
 def test_a_run_stands_up_runs_holds_and_leaves_the_motors_damped(
     drive: Callable[..., Stand],
 ) -> None:
-    stand = drive("--operator.duration=1")
+    stand = drive("--operator.duration=1", "--log.videos=1")
     words = stand.end()
     assert stand.program.returncode == 0, words
     modes = stand.modes()
@@ -173,7 +173,7 @@ def hang_up(program: subprocess.Popen[str]) -> None:
 def test_killing_the_planner_leaves_the_robot_standing_until_sigterm(
     drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
 ) -> None:
-    stand = drive("--log.videos=0")  # drawing takes minutes on a busy machine
+    stand = drive()
     stand.await_run()
     control = stand.control
     others = psutil.Process(stand.program.pid).children(recursive=True)

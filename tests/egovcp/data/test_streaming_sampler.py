@@ -104,7 +104,7 @@ def test_episodes_are_drawn_in_proportion_to_their_frames(six: EpisodeIndex) -> 
     np.testing.assert_allclose(drawn / drawn.sum(), six.length / six.num_frames, atol=0.02)
 
 
-@pytest.mark.parametrize("batch_size", [1, 8, 50])
+@pytest.mark.parametrize("batch_size", [1, 8, pytest.param(50, marks=pytest.mark.slow)])
 def test_resuming_any_number_of_times_continues_with_exactly_the_next_batches(
     six: EpisodeIndex, batch_size: int
 ) -> None:
@@ -149,7 +149,7 @@ def test_resuming_with_other_options_or_data_is_refused(
 
 
 # --- several processes, several datasets ------------------------------------------------------
-@pytest.mark.parametrize("ranks", [2, 6])
+@pytest.mark.parametrize("ranks", [2, pytest.param(6, marks=pytest.mark.slow)])
 def test_every_rank_yields_its_own_episodes(make_index: MakeIndex, ranks: int) -> None:
     """Also with fewer files than ranks."""
     index = make_index(10, 7)

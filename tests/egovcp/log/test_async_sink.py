@@ -234,7 +234,7 @@ for index in range(10_000):
 """
 
 
-@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize("background", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_kill_9_loses_less_than_a_second(tmp_path: Path, background: bool) -> None:
     path = tmp_path / "a.mcap"
     code = _RUN.format(tests=str(Path(__file__).parent), path=str(path), background=background)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from functools import partial
+from itertools import product
 from threading import current_thread, main_thread
 from typing import Any
 
@@ -54,7 +55,15 @@ def _gradients(model: WorldModel) -> dict[str, Tensor | None]:
     return {name: p.grad for name, p in model.named_parameters()}
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(
+    ("name", "threads"),
+    [
+        *(("debug", count) for count in (1, 3)),
+        *((name, 2) for name in CONFIGS),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in product(CONFIGS, (1, 3))),
+    ],
+    indirect=["threads"],
+)
 def test_it_is_the_gradient_of_the_loss(name: str, threads: int) -> None:
     batch = random_batch(3, 8)
     batch.is_first[1, 3] = True
@@ -90,7 +99,7 @@ def test_gradients_are_the_same_numbers_each_time() -> None:
     torch.set_num_threads(2)
     try:
         found = []
-        for _ in range(6):
+        for _ in range(4):
             model = toy_model().train()
             draws = sample_step_noise(model, batch, torch.Generator().manual_seed(0))
             world_model_gradients(model, batch, draws, precision=BF16)
@@ -154,7 +163,14 @@ class NoCopies(TorchDispatchMode):
     torch.cuda.is_available(), reason="what is kept for a device would be no tensor"
 )
 @pytest.mark.parametrize(
-    "name", ["rewards", "autoregressive", "temporal differences", "squared error of Q", "default"]
+    "name",
+    [
+        *("default", "temporal differences"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("rewards", "autoregressive", "squared error of Q")
+        ),
+    ],
 )
 def test_nothing_of_a_loss_waits_for_a_gpu(name: str) -> None:
     """Tensors without numbers, on a device that is not there: what depends on a number fails."""

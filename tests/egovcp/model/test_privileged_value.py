@@ -99,7 +99,7 @@ def test_the_gradient_reaches_the_model_and_is_that_of_the_loss() -> None:
 def test_q_learns_how_the_value_depends_on_actions_that_were_not_taken() -> None:
     """All recorded actions are equal; the value is the first coordinate of the action."""
     torch.manual_seed(0)
-    batch = random_batch(8, 6)
+    batch = random_batch(4, 4)
     batch.action.zero_()
     batch.prev_action.zero_()
 
@@ -112,7 +112,7 @@ def test_q_learns_how_the_value_depends_on_actions_that_were_not_taken() -> None
     model = WorldModel(dataclasses.replace(DEBUG, loss=loss, value_loss="mse")).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(150):
+    for _ in range(120):
         draws = sample_step_noise(model, batch, generator)
         world_model_gradients(model, batch, draws, value)
         optimizer.step()

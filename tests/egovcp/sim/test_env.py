@@ -56,7 +56,10 @@ def test_shapes_and_types(env: VectorEnv) -> None:
     assert observation.state.dtype == np.float32
 
 
-@pytest.mark.parametrize("task", ["ball", "wall", "arch", "sequence"])
+@pytest.mark.parametrize(
+    "task",
+    ["wall", "sequence", *(pytest.param(t, marks=pytest.mark.slow) for t in ("ball", "arch"))],
+)
 def test_an_episode_repeats_bit_for_bit_with_any_neighbours(
     env: VectorEnv, config: EnvConfig, task: str
 ) -> None:
@@ -67,7 +70,9 @@ def test_an_episode_repeats_bit_for_bit_with_any_neighbours(
         assert_same_row(a, 2, b, 0)
 
 
-@pytest.mark.parametrize("task", ["ball", "wall"])  # before a wall every ray is cast
+@pytest.mark.parametrize(
+    "task", [pytest.param("ball", marks=pytest.mark.slow), "wall"]
+)  # before a wall every ray is cast
 def test_threads_change_nothing(env: VectorEnv, config: EnvConfig, task: str) -> None:
     threaded = VectorEnv(replace(config, threads=2), 4)
     pairs = zip(

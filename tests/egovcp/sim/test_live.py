@@ -50,7 +50,10 @@ class Loop:
             self.live.advance(4)
 
 
-@pytest.mark.parametrize("task", ["ball", "wall", "arch", "sequence"])
+@pytest.mark.parametrize(
+    "task",
+    ["ball", "sequence", *(pytest.param(t, marks=pytest.mark.slow) for t in ("wall", "arch"))],
+)
 def test_it_is_the_episode_of_the_environment(
     live: LiveRobot, config: EnvConfig, task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,7 +81,7 @@ def outcome(env: VectorEnv, policy: EnvPolicy, task: str) -> tuple[float, float]
     return float(result.success.mean()), float(total.mean())
 
 
-@pytest.mark.parametrize("task", ["ball", "wall", "arch"])
+@pytest.mark.parametrize("task", ["ball", "wall", pytest.param("arch", marks=pytest.mark.slow)])
 def test_the_oracle_solves_what_holding_still_does_not(env: VectorEnv, task: str) -> None:
     held, held_return = outcome(env, Hold(), task)
     solved, solved_return = outcome(env, Oracle(), task)

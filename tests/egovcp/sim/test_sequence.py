@@ -57,6 +57,7 @@ def test_the_oracle_achieves_all_parts_and_hold_does_not(sequences: EnvConfig) -
         assert result.success.tolist() == [all(parts.values()) for parts in result.parts]
 
 
+@pytest.mark.slow
 def test_the_oracle_achieves_three_parts(sequences: EnvConfig) -> None:
     three = replace(sequences, sequence=SequenceConfig(("arch", "ball", "wall"), pause_ticks=12))
     result = play(three, Oracle())

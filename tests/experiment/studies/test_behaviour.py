@@ -46,7 +46,11 @@ def test_episodes_without_recovery_are_not_judged() -> None:
 
 @pytest.mark.parametrize(
     ("task", "key"),
-    [("ball", "empty_scene"), ("wall", "empty_scene"), ("arch", "pelvis_far")],
+    [
+        ("ball", "empty_scene"),
+        pytest.param("wall", "empty_scene", marks=pytest.mark.slow),
+        pytest.param("arch", "pelvis_far", marks=pytest.mark.slow),
+    ],
 )
 def test_every_task_is_measured(task: str, key: str, flags: list[str], tmp_path: Path) -> None:
     assert main([*flags, f"--task={task}"]) == 0

@@ -60,6 +60,11 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
         stack.enter_context(mock.patch.object(file_download, "time", impatient))
         if (config := sys.modules.get("datasets.config")) is not None:
             stack.enter_context(mock.patch.object(config, "HF_ENDPOINT", endpoint))
+        cache = Path(variables["HF_LEROBOT_HOME"]) / "hub"
+        for name in [name for name in sys.modules if name.startswith("lerobot.datasets.")]:
+            if hasattr(sys.modules[name], "HF_LEROBOT_HUB_CACHE"):
+                patch = mock.patch.object(sys.modules[name], "HF_LEROBOT_HUB_CACHE", cache)
+                stack.enter_context(patch)
         huggingface_hub.HfFileSystem.clear_instance_cache()
         try:
             yield

@@ -26,7 +26,9 @@ class NoResidual:
         return np.zeros((len(observation), ACTIONS), np.float32)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
+)
 def test_robots_of_randomised_physics_are_still_up_and_walking_after_two_seconds(seed: int):
     skill = Skill("alone", "", 2.0, walking((0.1, 0.6), (0.70, 0.74)))
     physics, sensors = DisturbanceConfig(models=16), SensorConfig()
@@ -64,7 +66,7 @@ def _short(name: str, seconds: float) -> SkillOutcome:
     return play(make_controller("walk"), short, 8, 3, DisturbanceConfig(models=8), SensorConfig())
 
 
-@pytest.mark.parametrize("name", ["walk", "crouch", "push"])
+@pytest.mark.parametrize("name", ["walk", pytest.param("crouch", marks=pytest.mark.slow), "push"])
 def test_on_stock_feet_and_randomised_physics_it_stays_up(name):
     """Short and few; docs/lowlevel.md has the table of 400 robots each."""
     outcome = _short(name, 4.0)

@@ -131,7 +131,7 @@ def test_it_becomes_harder_with_success_and_easier_with_falls():
 def test_ppo_learns_what_a_term_rewards():
     """With nothing but the cost of acting, it acts less and less boldly."""
     task = LowLevelTask(rewards=_only_action(RewardConfig()))
-    env = LowLevelEnv(32, task, WalkConfig(), SensorConfig())
+    env = LowLevelEnv(16, task, WalkConfig(), SensorConfig())
     learner = LowLevelLearner(
         env,
         NetworkConfig(actor=(16,), critic=(16,)),

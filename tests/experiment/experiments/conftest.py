@@ -1,0 +1,13 @@
+"""Reports of hundreds of cells."""
+
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_resamples() -> Iterator[None]:
+    """A bootstrap interval for each cell, whose last digits are not tested here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("egovcp.intervals._RESAMPLES", 500)
+        yield
