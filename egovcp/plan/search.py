@@ -168,8 +168,8 @@ def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tenso
 
     sum_{k<K} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
 
-    K is the horizon N. Under ``objective=value`` it is `spec.RETURN_STEPS`, the number of steps
-    whose rewards Q counts, if that is more: after the plan the last action is held.
+    K is the horizon N. Under ``objective=value`` it is `spec.RETURN_STEPS` if that is more, because
+    Q also counts later rewards: after the plan the last action is held.
     """
     actions = actions[..., : config.horizon, :]
     before = torch.cat([start[:, None].expand_as(actions[..., :1, :]), actions[..., :-1, :]], -2)
