@@ -57,7 +57,7 @@ class LossConfig:
     object and predicts the value of planned actions (mc if the data lacks the position); mc: Monte
     Carlo return; td: r + gamma Q'(h', z', a') with the next action of the data, 0 instead of Q'
     after a failure."""
-    sampled_actions: int = bounded(3, least=0, most=1000)
+    sampled_actions: int = bounded(7, least=0, most=1000)
     """privileged: actions per row to which Q is fitted besides the recorded one."""
     td_decay: float = bounded(0.98, least=0, below=1)
     """td: decay per step of the target network Q'; 0: no target network."""
