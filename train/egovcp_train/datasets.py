@@ -34,7 +34,6 @@ from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
-from egovcp.robot_spec import RobotSpec
 from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
 from egovcp_train.distributed import SINGLE, ProcessGroup
@@ -73,31 +72,40 @@ class TrainingData:
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
 
-def prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup = SINGLE) -> TrainingData:
-    """Open the datasets and fix the model's statistics.
+def prepare(
+    config: TrainConfig,
+    readers: tuple[DatasetReader, ...],
+    model: WorldModel,
+    group: ProcessGroup = SINGLE,
+) -> TrainingData:
+    """Read the datasets and fix the model's statistics.
 
     Local datasets are read and checked completely, of datasets that are streamed from the Hub a
     sample of the files. The first process downloads and checks before the others start.
 
     Raises:
         UsageError: the options contradict each other.
-        DataError: a dataset is missing, damaged, not finite, or of another specification.
+        DataError: a dataset is damaged, or not finite.
         EnvironmentFailure: the Hub cannot be reached.
     """
     if group.is_first:
-        data = _prepare(config, model, group)
+        data = _prepare(config, readers, model, group)
         group.broadcast(data.config.loading)
         return data
     loading = group.broadcast(config.loading)
-    return _prepare(dataclasses.replace(config, loading=loading), model, group)
+    return _prepare(dataclasses.replace(config, loading=loading), readers, model, group)
 
 
-def _prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup) -> TrainingData:
+def _prepare(
+    config: TrainConfig,
+    readers: tuple[DatasetReader, ...],
+    model: WorldModel,
+    group: ProcessGroup,
+) -> TrainingData:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
     config.returns.check()
-    readers = open_readers(config)
     for reader in readers:
         if config.returns.weights and spec.REWARD_TERMS_KEY not in reader.features:
             raise UsageError(
@@ -111,9 +119,11 @@ def _prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup) -> Tra
     return TrainingData(readers, config, *build(readers, config, sampling, mix, model, group))
 
 
-def robot_of(config: TrainConfig) -> RobotSpec:
-    """The robot of the data; raises as `open_readers`."""
-    return _open((config.datasets or (config.dataset,))[0], config).robot
+def open_in_turn(config: TrainConfig, group: ProcessGroup) -> tuple[DatasetReader, ...]:
+    """As `open_readers`; the first process downloads before the others start."""
+    readers = open_readers(config) if group.is_first else ()
+    group.broadcast(None)
+    return readers or open_readers(config)
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:

@@ -24,7 +24,6 @@ from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.packages import require_packages
 from egovcp.plan.backends import make_evaluator
-from egovcp.robot_spec import G1
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
 from egovcp_train import privileged_value
@@ -45,10 +44,10 @@ from egovcp_train.datasets import (
     EVALUATION_EPISODES,
     FRAME_BYTES,
     TrainingData,
+    open_in_turn,
     prepare,
     require_datasets,
     require_same_content,
-    robot_of,
     to_tensors,
 )
 from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
@@ -101,12 +100,13 @@ def train(config: TrainConfig) -> None:
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    robot = group.broadcast(robot_of(config) if group.is_first else G1)
+    readers = open_in_turn(config, group)
+    robot = readers[0].robot
     model = WorldModel(config.policy.world_model(robot), robot)
     initial: dict[str, Tensor] = {}
     if config.policy.pretrained_path and not config.resume:
         initial = pretrained_weights(model, config.policy.pretrained_path)
-    data = prepare(config, model, group)
+    data = prepare(config, readers, model, group)
     config = data.config
     if initial:
         model.load_state_dict(initial)
