@@ -14,7 +14,7 @@ from egovcp.errors import UsageError
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task
-from egovcp.spec import ACTION_RATE_LIMIT
+from egovcp.spec import ACTION_RATE_LIMIT, OBJECT_DIM
 
 if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
@@ -164,8 +164,19 @@ class BaseVectorEnv(ABC):
         """The observations of all rows."""
 
     @abstractmethod
+    def _in_range(self, position: Array) -> bool:
+        """Whether the camera could see an object at ``position`` (3,), m, base frame."""
+
     def known_objects(self) -> NDArray[np.float32]:
-        """(B, 4) position of each task's object, m, base frame, and 1; or zeros: not known."""
+        """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
+
+        An object is known while it is in range of the camera and still matters to the task.
+        """
+        found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
+        for row, task in enumerate(instance.task for instance in self.instances):
+            if self._in_range(position := task.object_b) and not task.finished:
+                found[row] = *position, 1.0
+        return found
 
     def damp(self, row: int) -> None:
         """Damp the motors of ``row`` until its next episode."""

@@ -30,7 +30,6 @@ from egovcp.spec import (
     DEPTH_COLS,
     DEPTH_MAX_M,
     DEPTH_ROWS,
-    OBJECT_DIM,
     STATE_DIM,
 )
 
@@ -231,19 +230,8 @@ class VectorEnv(BaseVectorEnv):
         for pending in [self._pool.submit(work, rows) for rows in chunks]:
             pending.result()
 
-    def known_objects(self) -> NDArray[np.float32]:
-        """(B, 4) position of each task's object, m, heading frame, and 1; or zeros.
-
-        An object is known while it is in front of the pelvis within the range of the camera, and
-        still matters to the task.
-        """
-        found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
-        for row, instance in enumerate(self.instances):
-            robot, task = instance.robot, instance.task
-            position = (task.state().position_w - robot.data.qpos[:3]) @ robot.heading
-            if 0.0 < position[0] < DEPTH_MAX_M and not task.finished:  # false for NaN
-                found[row] = *position, 1.0
-        return found
+    def _in_range(self, position: Array) -> bool:
+        return bool(0.0 < position[0] < DEPTH_MAX_M)  # in front of the pelvis; false for NaN
 
     def privileged_state(self) -> PrivilegedState:
         """The simulator's state now, for oracles, probes and logs, never for a policy."""

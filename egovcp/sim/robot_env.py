@@ -17,7 +17,6 @@ from egovcp.sim.mujoco_robot import Array, MujocoRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task
 from egovcp.sim.tasks.robot_task import RobotTask
-from egovcp.spec import OBJECT_DIM
 
 if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
@@ -158,16 +157,5 @@ class RobotEnv(BaseVectorEnv):
         state = np.array([instance.state for instance in self.instances], np.float32)
         return Observation(np.stack([instance.depth for instance in self.instances]), state)
 
-    def known_objects(self) -> NDArray[np.float32]:
-        """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
-
-        An object is known while it is within the range of the camera from the base, and still
-        matters to the task.
-        """
-        found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
-        for row, instance in enumerate(self.instances):
-            position = instance.task.object_b
-            near = np.linalg.norm(position) < self.robot.depth_max_m  # false for NaN
-            if near and not instance.task.finished:
-                found[row] = *position, 1.0
-        return found
+    def _in_range(self, position: Array) -> bool:
+        return bool(np.linalg.norm(position) < self.robot.depth_max_m)  # false for NaN
