@@ -36,9 +36,10 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that sign
 class EntryPoint:
     """A command whose module is imported when it is called."""
 
-    def __init__(self, prog: str, module: str) -> None:
-        """The command ``prog``, which is ``module.main(argv) -> int``."""
-        self.prog, self.module = prog, module
+    def __init__(self, prog: str, module: str, task_argument: int | None = None) -> None:
+        """The command ``prog``, which is ``module.main(argv) -> int``; the argument with number
+        ``task_argument`` may name a task, as ``--task`` does."""
+        self.prog, self.module, self._task_argument = prog, module, task_argument
 
     def __call__(self, argv: Sequence[str] | None = None) -> int:
         """Run the command on ``argv``, or on ``sys.argv``, and return its exit code."""
@@ -98,7 +99,7 @@ class EntryPoint:
         for i, arg in enumerate(args):
             value = arg.removeprefix("--task=")
             is_task = value != arg or (i and args[i - 1] == "--task")
-            if ":" in value and (is_task or (i == 1 and self.prog == "egovcp-task")):
+            if ":" in value and (is_task or i == self._task_argument):
                 from egovcp.sim.tasks.registry import register_task
 
                 items = value.split(",")
