@@ -39,7 +39,6 @@ _TYPES: Final[Mapping[str, Any]] = {
     "heldout": dict[str, float | None],
     "closed_loop": dict[str, float | None],
     "heldout_tasks": dict[str, dict[str, Any]],
-    "return_scales": dict[str, tuple[float, float]],
     "train_config": dict[str, Any],
 }
 _REQUIRED: Final = ("controller_id", "files")

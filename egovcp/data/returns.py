@@ -20,7 +20,7 @@ from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 
-ReturnScaling = Literal["dataset", "none", "per_task"]
+ReturnScaling = Literal["dataset", "none"]
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,7 @@ class ReturnConfig:
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""
     scale: ReturnScaling = "dataset"
-    """Normalisation of the return targets: dataset (over all tasks), none, or per_task (an
-    ablation)."""
+    """Normalisation of the return targets: dataset (over all tasks), or none."""
 
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for invalid values."""

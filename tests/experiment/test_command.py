@@ -86,15 +86,16 @@ def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFix
     """Collects, trains and reports through the real commands; again, nothing is left to do."""
     out = tmp_path / "out"
     argv = ["ablations", "--scale=smoke", f"--output_dir={out}", "--tasks=[ball]"]
-    argv += ["--only=[value_mse]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
+    argv += ["--only=[value_two_hot]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
     assert main(argv) == 0
     content = json.loads((out / "ablations.json").read_text())
-    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-value_mse-s0"]
+    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-value_two_hot-s0"]
     assert content["missing"] == []
     assert content["cells"]["collect-ball-10"]["figures"]["episodes"] == 10
-    assert "policy.value_loss=mse" in (out / "ablations.md").read_text()
-    model = out / "work" / "ablate-ball-value_mse-s0" / "checkpoints" / "last" / "pretrained_model"
-    assert json.loads((model / "config.json").read_text())["world_model"]["value_loss"] == "mse"
+    assert "policy.value_loss=two_hot" in (out / "ablations.md").read_text()
+    checkpoints = out / "work" / "ablate-ball-value_two_hot-s0" / "checkpoints"
+    model = json.loads((checkpoints / "last" / "pretrained_model" / "config.json").read_text())
+    assert model["world_model"]["value_loss"] == "two_hot"
     capsys.readouterr()
     assert main(argv) == 0
     assert "2 cells, 2 complete" in capsys.readouterr().out

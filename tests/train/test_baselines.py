@@ -138,7 +138,6 @@ def test_an_artifact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(
     [
         ({"planner__objective": "reward"}, "train it with --policy.loss.reward=1"),
         ({"planner__objective": "td"}, "train it with --policy.loss.reward=1"),
-        ({**TD, "returns__scale": "per_task"}, "no common unit"),
         (
             {"policy__loss__td_decay": 1.0},
             "--policy.loss.td_decay=1.0: expected at least 0 and less",

@@ -215,14 +215,9 @@ class TrainConfig:
                     f"--returns.weights puts {term} into Q, and --planner.{term}_cost charges it "
                     "again; set one of them to 0"
                 )
-        loss = self.policy.loss
-        if loss.q_target == "td" and self.returns.scale == "per_task":
-            raise UsageError(
-                "--policy.loss.q_target=td adds rewards to values, and --returns.scale=per_task "
-                "has no common unit for them; choose --returns.scale=dataset"
-            )
         if self.policy.dynamics == "autoregressive":
-            require_longer(self.sampling.length, loss.autoregressive_steps, "--sampling.length")
+            steps = self.policy.loss.autoregressive_steps
+            require_longer(self.sampling.length, steps, "--sampling.length")
 
 
 def default() -> TrainConfig:

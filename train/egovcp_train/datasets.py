@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
@@ -46,11 +46,8 @@ FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
 """Of the G1; that of another robot is of the same order."""
 
 _RETURNS: Final = ReturnConfig()
-_MIN_STD: Final = 1e-6
 
-type Built = tuple[
-    PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore], Mapping[str, ReturnScale]
-]
+type Built = tuple[PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore]]
 
 
 @dataclass(frozen=True)
@@ -68,8 +65,6 @@ class TrainingData:
     learning: Callable[[], EpisodeStore]
     """Reads the training episodes; those that are not in memory without images, and of a dataset
     on the Hub a sample of the files."""
-    return_scales: Mapping[str, ReturnScale]
-    """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
 
 def prepare(
@@ -251,17 +246,13 @@ def _in_memory(
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
-    scales: dict[str, ReturnScale] = {}
-    if config.returns.scale == "per_task":
-        scales = task_scales(learning)
-        learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
     complete = np.bincount(np.repeat(learning.dataset, learning.length), weights=learning.mc_valid)
     _require_returns(readers, learning.dataset, complete)
     set_normalisation(model, learning, config.returns)
     rows = group.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=group.count * sampling.batch_size)
     stream = PrefetchIterator(InMemorySampler(learning, sampling, mix, rows))
-    return stream, heldout, lambda: learning, scales
+    return stream, heldout, lambda: learning
 
 
 def _on_disk(
@@ -272,11 +263,6 @@ def _on_disk(
     model: WorldModel,
     group: ProcessGroup,
 ) -> Built:
-    if config.returns.scale == "per_task":
-        raise UsageError(
-            "--returns.scale=per_task needs all episodes in memory, and these are read from the "
-            "disk; give --loading.mode=ram, or --returns.scale=dataset"
-        )
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = learning
     if learning.is_remote:
@@ -303,7 +289,7 @@ def _on_disk(
         checked=not learning.is_remote,
     )
     without_images = partial(EpisodeStore.read, sample, config.returns, images=False)
-    return PrefetchIterator(stream), heldout, without_images, {}
+    return PrefetchIterator(stream), heldout, without_images
 
 
 def _require_returns(
@@ -367,41 +353,3 @@ def _set_statistics(
             "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
     model.set_statistics(state_mean, state_std, returns, config.scale != "none", config.gamma)
-
-
-# --- the ablation `returns.scale=per_task` --------------------------------------------
-class ReturnScale(NamedTuple):
-    """Mean and standard deviation of the complete returns of a task."""
-
-    mean: float
-    std: float
-
-
-def task_scales(store: EpisodeStore) -> dict[str, ReturnScale]:
-    """Task -> scale of its returns; without the tasks that have no complete return."""
-    tasks = np.repeat(np.array(store.tasks), store.length)
-    found: dict[str, ReturnScale] = {}
-    for task in sorted(set(store.tasks)):
-        returns = store.mc_return[store.mc_valid & (tasks == task)].astype(np.float64)
-        if len(returns):
-            found[task] = ReturnScale(float(returns.mean()), max(float(returns.std()), _MIN_STD))
-    return found
-
-
-def on_task_scales(store: EpisodeStore, scales: Mapping[str, ReturnScale]) -> EpisodeStore:
-    """The store with the returns of each task standardised by its scale.
-
-    Raises:
-        DataError: the scale of a task is unknown.
-    """
-    unknown = sorted(set(store.tasks) - scales.keys())
-    if unknown:
-        raise DataError(
-            f"no scale of returns is known for task {unknown[0]!r}, only for "
-            f"{', '.join(sorted(scales)) or 'none'}; use --returns.scale=dataset, or other data"
-        )
-    mean, std = (
-        np.repeat([getattr(scales[task], name) for task in store.tasks], store.length)
-        for name in ReturnScale._fields
-    )
-    return dataclasses.replace(store, mc_return=((store.mc_return - mean) / std).astype(np.float32))

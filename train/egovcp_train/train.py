@@ -352,13 +352,12 @@ def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
         UsageError: the windows or the number of processes have changed.
     """
     state, stream = load_training_state(output), data.stream
-    if "datasets" in state:  # not in checkpoints of earlier versions
-        require_same_content(data.readers, state["datasets"])
+    require_same_content(data.readers, state["datasets"])
     with restoring(output):
         learner.load_state_dict(state["learner"])
-        streams = state.get("streams") or [state["stream"]]
+        streams = state["streams"]
         stream.load_state_dict(streams[min(learner.group.rank, len(streams) - 1)])
-        return float(state.get("seconds", 0.0))
+        return float(state["seconds"])
 
 
 def _provenance(data: TrainingData) -> dict[str, Any]:
@@ -372,7 +371,6 @@ def _provenance(data: TrainingData) -> dict[str, Any]:
             for r in readers
         ],
         "heldout_episodes": describe_heldout(readers),
-        "return_scales": {task: list(scale) for task, scale in data.return_scales.items()},
         "train_config": draccus.encode(data.config),
         "command": [PROG, *sys.argv[1:]],
     }

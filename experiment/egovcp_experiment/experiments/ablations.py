@@ -27,12 +27,11 @@ CHOICES: Final[dict[str, Flags]] = {
     "default": {},
     **{name: {"preset": name} for name in _PRESETS},
     "raw_returns": {"returns.scale": "none"},
-    "value_mse": {"policy.value_loss": "mse"},
+    "value_two_hot": {"policy.value_loss": "two_hot"},
     "reward_head": {"policy.loss.reward": 1},
     "arwm": {"policy.dynamics": "autoregressive"},
     "td": {"policy.loss.q_target": "td"},
-    "long_windows": {"sampling.length": 40, "batch_size": 8},  # as many rows per step
-    "per_task_returns": {"returns.scale": "per_task"},
+    "short_windows": {"sampling.length": 16, "batch_size": 80},  # as many rows per step
 }
 
 
@@ -75,8 +74,8 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
             "(x): times below the error of repeating the last image, at that many ticks "
-            "open-loop. `paper` and `per_task_returns` are judged against their own returns, "
-            "which differ from those of the others.",
+            "open-loop. `paper` is judged against its own returns, which differ from those of the "
+            "others.",
             *(_table(task, rows) for task, rows in figures.items()),
         ),
         figures,

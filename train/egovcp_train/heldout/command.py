@@ -22,7 +22,7 @@ from egovcp.outputs import require_writable
 from egovcp.policy_options import PolicyOptions
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_train.datasets import EVALUATION_EPISODES, ReturnScale, on_task_scales
+from egovcp_train.datasets import EVALUATION_EPISODES
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure
@@ -87,8 +87,6 @@ def evaluate(config: HeldoutConfig) -> None:
     returns = returns_of(artifact)
     limit = config.episodes or None
     store = EpisodeStore.load([reader], config.split, returns, per_task=limit)
-    if returns.scale == "per_task":
-        store = on_task_scales(store, _return_scales(artifact))
     model = artifact.world_model.to(device)
     with stop_on_signal() as received:
         stopped = partial(bool, received)
@@ -129,21 +127,6 @@ def require_same_controller(artifact: Artifact, reader: DatasetReader) -> None:
             f"{reader.controller_id!r}: the same actions lead elsewhere; choose a dataset of the "
             "policy's controller"
         )
-
-
-def _return_scales(artifact: Artifact) -> dict[str, ReturnScale]:
-    """The scales of the training.
-
-    Raises:
-        ArtifactError: they cannot be read.
-    """
-    try:
-        return {k: ReturnScale(*v) for k, v in artifact.manifest["return_scales"].items()}
-    except (AttributeError, KeyError, TypeError) as error:
-        raise ArtifactError(
-            f"{artifact.path}: its manifest does not say on which scale each task's returns were "
-            "(return_scales); train again with this version"
-        ) from error
 
 
 def _run(config: HeldoutConfig, artifact: Artifact, reader: DatasetReader) -> dict[str, Any]:
