@@ -23,7 +23,7 @@ from itertools import batched
 import numpy as np
 from report import parser, publish
 
-from egovcp.intervals import Interval, wilson
+from egovcp.intervals import Interval
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.env import VectorEnv
@@ -33,7 +33,7 @@ from egovcp.spec import PLANNER_DT
 from egovcp_deploy.controllers import Action, search_constant
 from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.options import held_out
-from egovcp_deploy.scores import EpisodeScore, reward_interval, reward_per_step, success_rate
+from egovcp_deploy.scores import EpisodeScore, eval_scores
 
 PLAYERS = ("hold", "constant", "random", "oracle")
 PUSHED = ("hold", "oracle")  # for the wall at one push speed after another
@@ -60,12 +60,12 @@ class Result:
 
 def result(scores: Sequence[EpisodeScore], action: Action = ()) -> Result:
     """The figures of a player's episodes."""
-    rate = success_rate(scores)
+    found = eval_scores(scores)
     return Result(
-        success=rate,
-        success_ci95=wilson(round(rate * len(scores)), len(scores)),
-        reward=reward_per_step(scores),
-        reward_ci95=reward_interval(scores),
+        success=found.success_rate,
+        success_ci95=found.success_interval,
+        reward=found.reward_per_step,
+        reward_ci95=found.reward_interval,
         falls=sum(score.terminated for score in scores) / len(scores),
         action=action,
     )

@@ -11,15 +11,7 @@ from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
 from egovcp.files import read_json
 from egovcp.terminal import echo
-from egovcp_deploy.scores import (
-    EpisodeScore,
-    aligned,
-    paired,
-    reward_gain,
-    reward_per_step,
-    success_gain,
-    success_rate,
-)
+from egovcp_deploy.scores import EpisodeScore, aligned, eval_scores, paired
 
 PROG: Final = "egovcp-compare"
 _FILE: Final = "eval_run.json"
@@ -159,19 +151,19 @@ def _line(
     a, b = paired(scores, other_scores)
     if not a:
         raise UsageError(f"no scenario of {task} was played by both")
-    low, high = success_gain(a, b)
-    reward_low, reward_high = reward_gain(a, b)
+    run, other = eval_scores(a), eval_scores(b)
+    success, success_range, reward, reward_range = run.gain(other).columns()
     return (
         task,
         str(len(a)),
-        f"{success_rate(a):.1%}",
-        f"{success_rate(b):.1%}",
-        f"{100 * (success_rate(a) - success_rate(b)):+.1f}",
-        f"{100 * low:+.1f} to {100 * high:+.1f}",
-        f"{reward_per_step(a):+.5f}",
-        f"{reward_per_step(b):+.5f}",
-        f"{reward_per_step(a) - reward_per_step(b):+.5f}",
-        f"{reward_low:+.5f} to {reward_high:+.5f}",
+        f"{run.success_rate:.1%}",
+        f"{other.success_rate:.1%}",
+        success,
+        success_range,
+        f"{run.reward_per_step:+.5f}",
+        f"{other.reward_per_step:+.5f}",
+        reward,
+        reward_range,
     )
 
 

@@ -21,7 +21,7 @@ from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.options import PLANNER, for_search
-from egovcp_deploy.scores import EpisodeScore, reward_per_step
+from egovcp_deploy.scores import EpisodeScore, eval_scores
 
 type Action = tuple[float, ...]
 #: Plays all scenarios with each action; returns the scores of each action.
@@ -103,11 +103,11 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
         scenarios = [for_search(task, seed, first + i) for i in range(count)]
         for action, played in zip(candidates, play(candidates, scenarios), strict=True):
             scores[action] += played
-        candidates.sort(key=lambda action: -reward_per_step(scores[action]))
+        candidates.sort(key=lambda action: -eval_scores(scores[action]).reward_per_step)
         candidates, count = candidates[: max(1, len(candidates) // _REDUCTION)], count * 2
-    best = scores[candidates[0]]
-    rate = float(np.mean([score.success for score in best]))
-    return BestConstant(candidates[0], reward_per_step(best), rate, len(best))
+    best = eval_scores(scores[candidates[0]])
+    rate, count = best.success_rate, best.success.size
+    return BestConstant(candidates[0], best.reward_per_step, rate, count)
 
 
 def load_constants(path: Path) -> dict[str, BestConstant]:

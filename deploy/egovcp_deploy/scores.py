@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egovcp.intervals import Interval, bootstrap, wilson
+from egovcp.intervals import EvalScores, wilson
 from egovcp.terminal import one_line
 
 #: Task -> controller -> episodes.
@@ -48,42 +47,11 @@ def success_rate(scores: Sequence[EpisodeScore]) -> float:
     return sum(score.success for score in scores) / len(scores)
 
 
-def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
-    """Sum of all rewards over the number of all steps."""
-    return sum(score.reward for score in scores) / sum(score.steps for score in scores)
-
-
-def reward_interval(scores: Sequence[EpisodeScore]) -> Interval:
-    """Bootstrap interval of `reward_per_step` over episodes."""
-    return bootstrap(_resampled_reward(scores), len(scores))
-
-
-def reward_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
-    """Bootstrap interval of the difference in `reward_per_step` on the *same* scenarios."""
-    pairs = paired(scores, others)
-    a, b = map(_resampled_reward, pairs)
-    return bootstrap(lambda i: a(i) - b(i), len(pairs[0]))
-
-
-def _resampled_reward(
-    scores: Sequence[EpisodeScore],
-) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
-    """Indices (R, E) of episodes -> (R,) `reward_per_step` of each row."""
-    rewards = np.array([score.reward for score in scores], np.float64)
-    steps = np.array([score.steps for score in scores], np.float64)
-
-    def of(indices: NDArray[np.int64]) -> NDArray[np.float64]:
-        rates: NDArray[np.float64] = rewards[indices].sum(axis=1) / steps[indices].sum(axis=1)
-        return rates
-
-    return of
-
-
-def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
-    """Bootstrap interval of the difference in success rate on the *same* scenarios."""
-    pairs = zip(*paired(scores, others), strict=True)
-    gains = np.array([float(a.success) - float(b.success) for a, b in pairs])
-    return bootstrap(lambda i: gains[i].mean(axis=1), len(gains))
+def eval_scores(scores: Sequence[EpisodeScore]) -> EvalScores:
+    """The episodes as one row of `EvalScores`."""
+    rows = [[score.reward, score.steps, score.success] for score in scores]
+    reward, steps, success = np.array(rows, np.float64).T[:, None]
+    return EvalScores(reward, steps, success)
 
 
 # --- eval.json -------------------------------------------------------------------------------
@@ -92,11 +60,12 @@ def summarise(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
     ``parts``: part -> ``success_rate`` and ``success_ci95``."""
     plan_ms = np.concatenate([score.plan_ms for score in scores])
     parts = {name: _successes([score.parts[name] for score in scores]) for name in scores[0].parts}
+    found = eval_scores(scores)
     return {
         "episodes": len(scores),
         **_successes([score.success for score in scores]),
-        "reward_mean": reward_per_step(scores),
-        "reward_ci95": list(reward_interval(scores)),
+        "reward_mean": found.reward_per_step,
+        "reward_ci95": list(found.reward_interval),
         "plan_ms_p50": float(np.percentile(plan_ms, 50)),
         "plan_ms_p99": float(np.percentile(plan_ms, 99)),
         **({"parts": parts} if parts else {}),

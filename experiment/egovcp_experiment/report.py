@@ -85,16 +85,6 @@ def percent_range(interval: Sequence[float]) -> str:
     return f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f} %"
 
 
-def points_range(interval: Sequence[float]) -> str:
-    """An interval of differences of rates, percentage points, as ``-3.0 to +8.5``."""
-    return f"{100 * interval[0]:+.1f} to {100 * interval[1]:+.1f}"
-
-
-def signed_range(interval: Sequence[float]) -> str:
-    """An interval of rewards per step as ``-0.00120 to +0.00340``."""
-    return f"{interval[0]:+.5f} to {interval[1]:+.5f}"
-
-
 def draw(
     name: str,
     caption: str,

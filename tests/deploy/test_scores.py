@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from egovcp_deploy.scores import (
     EpisodeScore,
-    reward_interval,
-    reward_per_step,
-    success_gain,
+    eval_scores,
+    paired,
     summarise,
     summary,
     table,
@@ -24,24 +22,15 @@ def score(episode: int, success: bool, reward: float = 0.0, steps: int = 10) -> 
 
 def test_reward_per_step_weighs_episodes_by_their_length() -> None:
     scores = [score(0, True, 1.0, steps=10), score(1, False, 0.0, steps=90)]
-    assert reward_per_step(scores) == pytest.approx(0.01)
-
-
-def test_the_reward_interval_has_its_nominal_coverage() -> None:
-    rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(60):
-        rewards = rng.normal(0.5, 1.0, 80)
-        low, high = reward_interval([score(i, True, r, 1) for i, r in enumerate(rewards)])
-        covered += low <= 0.5 <= high
-    assert 50 <= covered <= 60
+    assert eval_scores(scores).reward_per_step == pytest.approx(0.01)
 
 
 def test_the_gain_is_paired_by_scenario() -> None:
     ours = [score(i, i % 2 == 0) for i in range(40)]
-    assert success_gain(ours, list(reversed(ours))) == (0.0, 0.0)
+    a, b = map(eval_scores, paired(ours, list(reversed(ours))))
+    assert a.gain(b).success_interval == (0.0, 0.0)
     worse = [score(i, False) for i in range(40)]
-    low, high = success_gain(ours, worse)
+    low, high = eval_scores(ours).gain(eval_scores(worse)).success_interval
     assert 0.3 < low < 0.5 < high < 0.7
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egovcp_experiment.results import EvalScores, eval_scores
+from egovcp.intervals import EvalScores
+from egovcp_experiment.results import eval_scores
 
 
 def made(success: np.ndarray, reward: np.ndarray | None = None) -> EvalScores:

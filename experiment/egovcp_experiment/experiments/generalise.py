@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from egovcp.intervals import EvalScores
 from egovcp.sim.tasks.sequence import SequenceTask
 from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results
@@ -75,8 +76,8 @@ _SEQUENCES: Final[dict[str, Flags]] = {
 class _Condition:
     """Scores in one condition."""
 
-    planner: results.EvalScores
-    references: dict[str, results.EvalScores]
+    planner: EvalScores
+    references: dict[str, EvalScores]
 
 
 def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:

@@ -157,7 +157,7 @@ def _centimetres(metres: float | None, form: str = ".1f") -> str:
 
 def _strip_plot(task: str, strips: Sequence[Mapping[str, Any]]) -> Plot:
     def paint(figure: Any) -> None:
-        rows = [(kind, strip[kind]) for strip in strips for kind in ("seen", "foreseen")]
+        rows = [(kind, strip[kind]) for strip in strips for kind in ("seen", "imagined")]
         axes = figure.subplots(len(rows), len(HORIZONS), squeeze=False)
         for at, k in zip(axes[0], HORIZONS, strict=True):
             at.set_title("filtered" if k == 0 else f"+{k}", fontsize=8)

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from egovcp.intervals import EvalScores, points_range
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
@@ -17,7 +18,6 @@ from egovcp_experiment.report import (
     Plot,
     draw,
     number,
-    points_range,
 )
 
 SUMMARY: Final = "one model on mixed data against one per task; t-SNE of h and z (fig. 6)"
@@ -86,13 +86,13 @@ def _introduction(config: ExperimentConfig) -> str:
     )
 
 
-def _level(scores: results.EvalScores, references: Mapping[str, results.EvalScores]) -> float:
+def _level(scores: EvalScores, references: Mapping[str, EvalScores]) -> float:
     """Reward per step on a scale from the random walk (0) to the oracle (1)."""
     low, high = references["random"].reward_per_step, references["oracle"].reward_per_step
     return (scores.reward_per_step - low) / (high - low) if high != low else float("nan")
 
 
-def _conclusion(task: str, scores: Mapping[str, results.EvalScores]) -> str:
+def _conclusion(task: str, scores: Mapping[str, EvalScores]) -> str:
     single, mixed = scores["single"], scores["mixed"]
     gain = mixed.gain(single)
     low, high = gain.success_interval

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from egovcp.intervals import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, CellFigure, Flags
 from egovcp_experiment.config import ExperimentConfig
@@ -86,9 +87,7 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
     return ExperimentReport(title, tuple(shows), tuple(parts), figures)
 
 
-def _timings(
-    task: str, timed: Mapping[str, Any], played: Mapping[str, results.EvalScores]
-) -> Table:
+def _timings(task: str, timed: Mapping[str, Any], played: Mapping[str, EvalScores]) -> Table:
     columns = ("samples", "iterations", "elites")
     rows = tuple(
         (name, *(str(row[column]) for column in columns), f"{row['plan_ms']:.1f}")
@@ -100,7 +99,7 @@ def _timings(
 
 
 def _conclusions(
-    task: str, kind: str, scores: Mapping[str, results.EvalScores], reference: str
+    task: str, kind: str, scores: Mapping[str, EvalScores], reference: str
 ) -> list[str]:
     if reference not in scores or len(scores) < 2:
         return []

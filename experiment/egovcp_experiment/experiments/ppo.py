@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from egovcp.errors import UsageError
+from egovcp.intervals import EvalScores
 from egovcp.sim.config import evaluation_config
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
@@ -35,7 +36,7 @@ def ppo_plays(grid: Grid, task: str) -> dict[int, list[str]]:
     return found
 
 
-def ppo_scores(grid: Grid, task: str, records: results.Records) -> dict[int, results.EvalScores]:
+def ppo_scores(grid: Grid, task: str, records: results.Records) -> dict[int, EvalScores]:
     """Transitions -> scores of PPO."""
     return results.all_scores(records, ppo_plays(grid, task), task, "ppo")
 
@@ -122,9 +123,9 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
 def _conclusions(
     task: str,
     offline: int,
-    planner: results.EvalScores | None,
-    ppo: Mapping[int, results.EvalScores],
-    bounds: Mapping[str, results.EvalScores],
+    planner: EvalScores | None,
+    ppo: Mapping[int, EvalScores],
+    bounds: Mapping[str, EvalScores],
 ) -> list[str]:
     count, last = list(ppo.items())[-1]
     lines = []
@@ -146,7 +147,7 @@ def _conclusions(
     return lines
 
 
-def _versus(scores: results.EvalScores, other: results.EvalScores) -> str:
+def _versus(scores: EvalScores, other: EvalScores) -> str:
     """Better or worse by reward, which PPO is trained on."""
     gain = scores.gain(other)
     return f"{gain.word(same='no different beyond chance')} ({gain})"

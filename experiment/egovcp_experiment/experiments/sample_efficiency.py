@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+from egovcp.intervals import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import TASKS, EpisodesConfig, ExperimentConfig
@@ -106,7 +107,7 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
     return ExperimentReport(title, tuple(shows), (*parts, *tables), figures)
 
 
-def _conclusion(task: str, named: Mapping[str, results.EvalScores]) -> str:
+def _conclusion(task: str, named: Mapping[str, EvalScores]) -> str:
     names = list(named)
     first, last = named[names[0]], named[names[-1]]
     if len(names) < 2:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from egovcp.intervals import EvalScores, Gain
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
@@ -28,7 +29,7 @@ SUMMARY: Final = (
 
 type PlayCells = dict[str, dict[str, dict[int, str]]]
 """Task -> row -> training seed -> name of the cell."""
-type Scores = dict[str, dict[str, results.EvalScores]]
+type Scores = dict[str, dict[str, EvalScores]]
 """Task -> row -> scores."""
 
 
@@ -66,7 +67,7 @@ class Verdict:
 
     claim: Claim
     task: str
-    gain: results.Gain
+    gain: Gain
     """``above`` minus ``below``."""
     agreeing: int
     """Trainings in which ``above`` has more reward."""
@@ -275,7 +276,7 @@ def _conclusions(verdicts: Sequence[Verdict], scores: Scores) -> list[str]:
     return lines + [_best_horizon(task, rows) for task, rows in scores.items() if OURS in rows]
 
 
-def _best_horizon(task: str, rows: Mapping[str, results.EvalScores]) -> str:
+def _best_horizon(task: str, rows: Mapping[str, EvalScores]) -> str:
     ours = {n: rows[f"ours_n{n}"] for n in _HORIZONS if f"ours_n{n}" in rows}
     text = f"{task}: {percent(rows[OURS].success_rate)} success at N=4"
     if len(ours) < 2:

@@ -8,11 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from egovcp.intervals import EvalScores, signed_range
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.grid import Grid, Variant
-from egovcp_experiment.report import ExperimentReport, Part, Plot, Table, draw, signed_range
+from egovcp_experiment.report import ExperimentReport, Part, Plot, Table, draw
 from egovcp_experiment.studies.residuals import STEPS
 
 SUMMARY: Final = (
@@ -100,7 +101,7 @@ def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
 
 
 def _conclusions(
-    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, results.EvalScores]
+    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, EvalScores]
 ) -> list[str]:
     lines = []
     for kind, row in plans.items():
@@ -127,7 +128,7 @@ def _conclusions(
 
 
 def _plot(
-    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, results.EvalScores]
+    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, EvalScores]
 ) -> Plot:
     def paint(figure: Any) -> None:
         left, right = figure.subplots(1, 2)

@@ -58,7 +58,7 @@ def measure(config: OpenLoopConfig) -> None:
         errors[str(k)] = _errors(images)
     most_moving = sorted(range(len(clips)), key=lambda i: -_moving_share(seen[i]))[:_SHOWN]
     strips = [
-        {"seen": _centimetres(seen[i]), "foreseen": _centimetres(imagined[i])} for i in most_moving
+        {"seen": _centimetres(seen[i]), "imagined": _centimetres(imagined[i])} for i in most_moving
     ]
     config.write({"episodes": len(clips), "errors_m": errors, "strips": strips})
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egovcp.intervals import Gain
 from egovcp_experiment.cell import ARTIFACT, PLAY, TRAIN, Cell, CellOutput
 from egovcp_experiment.config import SCALES, ExperimentConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.experiments.table1 import Claim, Verdict, count_verdicts, judge
 from egovcp_experiment.report import ExperimentReport, Table
-from egovcp_experiment.results import Gain
 
 TABLE1 = EXPERIMENTS["table1"]
 SEEDS = (0, 1)
