@@ -21,18 +21,6 @@ def describe(values: NDArray[Any]) -> Statistics:
     return {"min": array.min(0), "max": array.max(0), "mean": array.mean(0), "std": array.std(0)}
 
 
-def aggregate(parts: list[tuple[int, Statistics]]) -> Statistics:
-    """Statistics of the union of parts with these numbers of frames. Of statistics besides those
-    of `describe`, such as quantiles, it is the weighted mean, as in LeRobot."""
-    counts = np.array([count for count, _ in parts], np.float64)
-    stacked = {name: np.stack([part[name] for _, part in parts]) for name in parts[0][1]}
-    weight = (counts / counts.sum()).reshape(-1, *[1] * (stacked["mean"].ndim - 1))
-    out = {name: (values * weight).sum(0) for name, values in stacked.items()}
-    spread = stacked["std"] ** 2 + (stacked["mean"] - out["mean"]) ** 2
-    extremes = {"min": stacked["min"].min(0), "max": stacked["max"].max(0)}
-    return {**out, **extremes, "std": np.sqrt((spread * weight).sum(0))}
-
-
 def statistics_problems(
     found: Mapping[str, object], expected: Statistics, feature: Feature
 ) -> Iterator[str]:

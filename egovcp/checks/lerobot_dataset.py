@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from egovcp.checks.feature_statistics import (
     Statistics,
-    aggregate,
     camera_statistics_problems,
     describe,
     statistics_problems,
@@ -28,6 +27,7 @@ from egovcp.data import schema
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
+from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError
 
 type Progress = Callable[[int, int], None]
@@ -156,7 +156,7 @@ class LeRobotCheck:
             if feature.is_camera:
                 problems = camera_statistics_problems(found, feature)
             elif complete and key in self._sums:
-                problems = statistics_problems(found, aggregate(self._sums[key]), feature)
+                problems = statistics_problems(found, aggregate_named(self._sums[key]), feature)
             else:
                 continue
             yield from (DataError.at(path, f"{key}: {problem}") for problem in problems)

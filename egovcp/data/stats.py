@@ -21,7 +21,6 @@ from egovcp.robot_spec import G1, RobotSpec
 
 QUANTILES: Final = (0.01, 0.10, 0.50, 0.90, 0.99)
 ROWS: Final = ("min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES))
-_MIN, _MAX, _MEAN, _STD, _QUANTILES = 0, 1, 2, 3, slice(4, None)
 
 type Matrix = NDArray[np.float64]
 
@@ -73,15 +72,20 @@ def _depth_stats(depth: NDArray[np.uint16]) -> Matrix:
 
 def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
     """Statistics of the union of episodes, or groups of them, with these frame counts."""
-    stacked, weight = np.stack(matrices), np.asarray(counts, dtype=np.float64)[:, None]
-    total = weight.sum()
-    out: Matrix = np.empty_like(stacked[0])
-    out[_MIN], out[_MAX] = stacked[:, _MIN].min(0), stacked[:, _MAX].max(0)
-    out[_MEAN] = (stacked[:, _MEAN] * weight).sum(0) / total
-    spread = stacked[:, _STD] ** 2 + (stacked[:, _MEAN] - out[_MEAN]) ** 2
-    out[_STD] = np.sqrt((spread * weight).sum(0) / total)
-    out[_QUANTILES] = (stacked[:, _QUANTILES] * weight[:, None]).sum(0) / total
-    return out
+    named = [dict(zip(ROWS, matrix, strict=True)) for matrix in matrices]
+    union = aggregate_named(list(zip(counts, named, strict=True)))
+    return np.stack([union[name] for name in ROWS])
+
+
+def aggregate_named(parts: Sequence[tuple[int, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
+    """Statistic -> its value for the union of parts, which have these frame counts."""
+    counts = np.array([count for count, _ in parts], np.float64)
+    stacked = {name: np.stack([part[name] for _, part in parts]) for name in parts[0][1]}
+    weight = counts.reshape(-1, *[1] * (stacked["mean"].ndim - 1))
+    out = {name: (values * weight).sum(0) / counts.sum() for name, values in stacked.items()}
+    spread = stacked["std"] ** 2 + (stacked["mean"] - out["mean"]) ** 2
+    out["std"] = np.sqrt((spread * weight).sum(0) / counts.sum())
+    return {**out, "min": stacked["min"].min(0), "max": stacked["max"].max(0)}
 
 
 def to_json(matrix: Matrix, count: int, robot: RobotSpec = G1) -> dict[str, dict[str, object]]:

@@ -7,8 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.checks.feature_statistics import Statistics, aggregate, describe
+from egovcp.checks.feature_statistics import Statistics, describe
 from egovcp.data.lerobot import LeRobotReader, values_of
+from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.statistics import Distribution
@@ -77,7 +78,7 @@ def _statistics(reader: LeRobotReader) -> dict[str, Statistics]:
                     problem = getattr(error, "problem", "") or f"column {error} is missing"
                     raise DataError.at(path, problem, number) from error
                 parts[feature.key].append((len(table), describe(values)))
-    return {key: aggregate(found) for key, found in parts.items() if found}
+    return {key: aggregate_named(found) for key, found in parts.items() if found}
 
 
 def _by_value(reader: LeRobotReader, key: str, found: Statistics) -> dict[str, dict[str, float]]:

@@ -19,13 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from egovcp.checks.feature_statistics import Statistics, aggregate, describe
+from egovcp.checks.feature_statistics import Statistics, describe
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import files, schema
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
-from egovcp.data.stats import QUANTILES
+from egovcp.data.stats import QUANTILES, aggregate_named
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError
 
@@ -188,7 +188,7 @@ class SubsetWriter:
         info = dict(reader.info)
         totals = {"total_episodes": count, "total_frames": self.num_frames}
         info |= {**totals, "total_tasks": len(tasks), "splits": {"train": f"0:{count}"}}
-        total = {key: aggregate(parts) for key, parts in self._stats.items() if parts}
+        total = {key: aggregate_named(parts) for key, parts in self._stats.items() if parts}
         counts = {key: sum(n for n, _ in self._stats[key]) for key in total}
         stats = {
             key: {**{name: v.tolist() for name, v in value.items()}, "count": [counts[key]]}
