@@ -19,7 +19,7 @@ from egovcp.bounds import bounded
 from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import checkpoint_dir, new_checkpoint
 from egovcp_train.loop import Budget
-from egovcp_train.records import TensorBoardRecorder
+from egovcp_train.records import Records, TensorBoardRecorder
 
 type Log = dict[str, list[float]]
 
@@ -190,7 +190,7 @@ def run_iterations(
         The folder of the last policy, and whether the budget is spent.
     """
     budget = Budget(config.steps, config.max_minutes, spent=spent)
-    recorder = TensorBoardRecorder(output, enabled=config.tensorboard)
+    recorder = Records([TensorBoardRecorder(output)] if config.tensorboard else [])
 
     def save() -> None:
         state = learner.state_dict() | {"seconds": budget.spent}

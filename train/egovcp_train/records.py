@@ -36,34 +36,28 @@ class WandbConfig:
 
 
 class TensorBoardRecorder:
-    """Writes below OUTPUT_DIR/tensorboard; does nothing unless enabled."""
+    """Writes below OUTPUT_DIR/tensorboard."""
 
-    def __init__(self, output: Path, *, enabled: bool) -> None:
-        self._writer = None
-        if enabled:
-            # Imported here: it takes a second.
-            from torch.utils.tensorboard import SummaryWriter
+    def __init__(self, output: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes a second
 
-            self._writer = SummaryWriter(str(output / "tensorboard"))
+        self._writer = SummaryWriter(str(output / "tensorboard"))
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Record one value per name at ``step``."""
-        if self._writer is not None:
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, step)
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
 
     def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
         """Record an image (height, width, 3) at ``step``."""
-        if self._writer is not None:
-            self._writer.add_image(name, pixels, step, dataformats="HWC")
+        self._writer.add_image(name, pixels, step, dataformats="HWC")
 
     def policy(self, step: int, folder: Path) -> None:
         """Nothing: TensorBoard keeps no files."""
 
     def close(self) -> None:
         """Flush to disk."""
-        if self._writer is not None:
-            self._writer.close()
+        self._writer.close()
 
 
 class TrackioRecorder:

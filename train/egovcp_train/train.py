@@ -335,7 +335,7 @@ def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
 def _records(config: TrainConfig, output: Path) -> Records:
     found: list[TensorBoardRecorder | TrackioRecorder] = []
     if config.tensorboard:
-        found.append(TensorBoardRecorder(output, enabled=True))
+        found.append(TensorBoardRecorder(output))
     if config.wandb.enable:
         found.append(WandbRecorder(output, config.wandb, draccus.encode(config)))
     if config.trackio:

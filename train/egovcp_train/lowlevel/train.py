@@ -122,7 +122,7 @@ def train(config: LowLevelTrainConfig) -> None:
     spent = 0.0
     if config.resume:
         state = load_training_state(output)
-        spent = float(state.get("seconds", 0.0))  # checkpoints of earlier versions have none
+        spent = float(state["seconds"])
         with restoring(output):
             learner.load_state_dict(state)
     elif init is not None:
