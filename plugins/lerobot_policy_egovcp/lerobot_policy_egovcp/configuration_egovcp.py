@@ -71,11 +71,6 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 f"{self.drop_n_last_frames}; expected at least 2 and 0"
             )
         self.returns.check("--policy.returns")
-        if self.returns.scale == "per_task":
-            raise UsageError(
-                "--policy.returns.scale=per_task is an ablation of egovcp-train; choose dataset or "
-                "none"
-            )
         require_compatible(self.world_model, self.planner)
         require_affordable(self.world_model, self.planner)
         self._check_losses()
