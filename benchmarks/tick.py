@@ -90,12 +90,12 @@ def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLo
     pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned()), clock), state=State.ARMED)
     controller = make_controller(_CONTROLLER)
     if not checked:
-        loop = ControlLoop(body, hardware.eye, controller, pilot)
+        loop = ControlLoop(body, hardware.camera, controller, pilot)
         loop._motor_watch = _Unwatched()
         return loop
     return ControlLoop(
         body,
-        hardware.eye,
+        hardware.camera,
         controller,
         pilot,
         refusal=lambda: body.trouble,

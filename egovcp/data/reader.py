@@ -92,7 +92,7 @@ class DatasetReader:
     def open(cls, config: DatasetConfig) -> Self:
         """Open the dataset that ``config`` names, from disk or from the Hub (see `locate`).
 
-        If a collector replaces it by its next version meanwhile, it is opened again.
+        It is opened again if a collector replaces it by its next version while it is read.
         """
         source = locate(config)
         while True:

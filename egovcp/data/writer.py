@@ -188,8 +188,8 @@ class VersionWriter:
         if encoded.robot != self._robot:
             raise DataError(
                 f"an episode of robot {encoded.robot.robot_type} cannot be added to a dataset of "
-                f"robot {self._robot.robot_type}, or its names and sizes differ; write it to a "
-                "dataset of its own"
+                f"robot {self._robot.robot_type}, or its names and sizes differ; write it to "
+                "another dataset"
             )
         record = json.dumps(dict(encoded.record), allow_nan=False)
         task = self._tasks.setdefault(encoded.record["task"], len(self._tasks))

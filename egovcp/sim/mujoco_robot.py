@@ -9,7 +9,7 @@
         def state(self): ...                  # proprioception (S,)
 
 By default the physical values of an action are the targets of the actuators, in their order; a
-robot with a controller of its own overrides `command`, one with sensor noise `state` and `depth`.
+robot with another controller overrides `command`, one with sensor noise `state` and `depth`.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def build_scene(tasks: tuple[type[Task], ...], feet: FootModel) -> Scene:
             task.add_objects(spec)
             names = [body.name for body in spec.bodies]
             if "" in names or len(set(names)) < len(names):
-                raise ValueError("each of its bodies needs a name of its own")
+                raise ValueError("each of its bodies needs a name that no other body has")
             objects[task.name] = set(names) - known
             known.update(names)
             model = spec.compile() if task is tasks[-1] else None

@@ -125,7 +125,7 @@ class ControlLoop:
     def __init__(
         self,
         body: LowLevelRobot,
-        eye: DepthCamera,
+        camera: DepthCamera,
         controller: LowLevelController,
         pilot: Pilot,
         refusal: Callable[[], str] = lambda: "",
@@ -133,7 +133,7 @@ class ControlLoop:
         skipped: Callable[[], str] = lambda: "",
         link: Callable[[int], Mapping[str, float]] = lambda now_ns: {},
     ) -> None:
-        self._body, self._eye = body, eye
+        self._body, self._camera = body, camera
         self._controller = controller
         self.pilot = pilot
         self._refusal, self._fault, self._skipped = refusal, fault, skipped
@@ -153,7 +153,7 @@ class ControlLoop:
 
     def tick(self, now_ns: int, command: OperatorCommand = _NO_COMMAND) -> None:
         """One control tick at ``now_ns``; it always writes a motor command."""
-        reading, image = self._read(), self._eye.read()
+        reading, image = self._read(), self._camera.read()
         planner_tick = self._count % CONTROLLER_TICKS_PER_PLAN == 0
         self.pilot.receive_plans(now_ns)
         if self._pending and (planner_tick or self.pilot.has_plan):

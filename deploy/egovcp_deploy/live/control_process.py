@@ -72,7 +72,7 @@ class ControlProcess:
         self._planner = RemotePlanner(link)
         self._loop = ControlLoop(
             body,
-            hardware.eye,
+            hardware.camera,
             make_controller(setup.controller),
             Pilot(self._planner, setup.limits),
             refusal=lambda: body.refusal,

@@ -41,12 +41,12 @@ class Hardware:
     """What the control loop reads and writes."""
 
     body: BridgeRobot
-    eye: ZmqDepthCamera | RealSenseDepthCamera
+    camera: ZmqDepthCamera | RealSenseDepthCamera
 
     def link(self, now_ns: int) -> dict[str, float]:
         """Statistics of the messages of the last second, for the log: `Tick.link`."""
-        states, images = self.body.arrivals.stats(now_ns), self.eye.arrivals.stats(now_ns)
-        reading, image = self.body.read(), self.eye.read()
+        states, images = self.body.arrivals.stats(now_ns), self.camera.arrivals.stats(now_ns)
+        reading, image = self.body.read(), self.camera.read()
         figures = {
             "mode_machine": 0.0 if reading is None else float(reading.mode),
             **{f"state_{name}": value for name, value in asdict(states).items()},
@@ -58,7 +58,7 @@ class Hardware:
 
     def close(self) -> None:
         """Close both connections."""
-        self.eye.close()
+        self.camera.close()
         self.body.close()
 
 
@@ -77,6 +77,6 @@ def open_camera(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera
     """Connect to the camera; raises `EnvironmentFailure` if it does not answer."""
     if options.type == "realsense":
         return RealSenseDepthCamera.connect(options.realsense)
-    eye = ZmqDepthCamera(options.server)
-    eye.connect()
-    return eye
+    camera = ZmqDepthCamera(options.server)
+    camera.connect()
+    return camera

@@ -166,10 +166,10 @@ def simulated_robot(
     ours, theirs = multiprocessing.get_context("spawn").Pipe(duplex=False)
     with child_process(_simulate, fake, theirs, os.getpid(), name="egovcp-simulator"):
         theirs.close()
-        command, state, camera = _received_ports(ours)
-        eye = ZmqCameraConfig(port=camera, vertical_fov=config.env.camera.vertical_fov)
+        command, state, port = _received_ports(ours)
+        camera = ZmqCameraConfig(port=port, vertical_fov=config.env.camera.vertical_fov)
         bridge = BridgeConfig(state_port=state, command_port=command)
-        yield bridge, CameraOptions(server=eye)
+        yield bridge, CameraOptions(server=camera)
 
 
 def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:

@@ -57,8 +57,8 @@ class TopicMapping:
     """Text of the task."""
     features: dict[str, list[str] | str]
     """Feature -> ``/topic.field``, or a list of them, whose values are joined. More fields and
-    indices may follow, ``/joints.position[3]``. A message or field with fields of its own is an
-    image, or all numbers in it."""
+    indices may follow, ``/joints.position[3]``. A message or field that has fields is an image,
+    or all numbers in it."""
     names: dict[str, list[str]] = field(default_factory=dict)
     """Feature -> names of its values."""
     hold: list[str] = field(default_factory=list)

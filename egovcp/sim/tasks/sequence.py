@@ -42,7 +42,7 @@ class SequenceConfig:
     the last."""
     pause_ticks: int = bounded(25, least=0, most=MAX_TICKS)
     """Planner ticks from the end of a part (arch passed, ball on the floor) to the next one. A part
-    ends at the latest after the ticks of its own episodes."""
+    takes at most the ticks of its task's episodes."""
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -18,7 +18,7 @@ def test_images_start_at_the_filtered_state(flags: list[str], tmp_path: Path) ->
     assert found["episodes"] == 2
     for strip in found["strips"]:
         assert np.shape(strip["seen"]) == (len(open_loop.HORIZONS), 48, 64)
-        assert np.shape(strip["foreseen"]) == np.shape(strip["seen"])
+        assert np.shape(strip["imagined"]) == np.shape(strip["seen"])
     assert found["errors_m"]["0"]["repeat"] == 0.0
     assert found["errors_m"]["8"]["model"] > 0.0
 
@@ -35,5 +35,5 @@ def test_imagination_follows_the_actions_that_were_sent() -> None:
 
     clip = open_loop._Clip(Carry(torch.zeros(1, 1), torch.zeros(1, 1)))
     clip.sent = [np.full(7, float(k)) for k in range(16)]
-    foreseen = open_loop._imagine(Counter(), clip)  # type: ignore[arg-type]
-    assert foreseen[:, 0, 0].tolist() == [sum(range(k)) for k in open_loop.HORIZONS]
+    imagined = open_loop._imagine(Counter(), clip)  # type: ignore[arg-type]
+    assert imagined[:, 0, 0].tolist() == [sum(range(k)) for k in open_loop.HORIZONS]
