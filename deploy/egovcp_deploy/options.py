@@ -16,15 +16,10 @@ from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
 from egovcp.packages import is_installed
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.scenario import HELD_OUT, SEARCH, Scenario
 
 PLANNER: Final = "planner"
 _PACKAGES: Final = ("egovcp", "egovcp-deploy", "torch", "numpy")
-# Offsets of the scenario seeds. Collection counts its seeds from 0, so that evaluation and
-# deployment never play a scenario of the training data, nor one of the search for the best
-# constant action.
-HELD_OUT: Final = 1_000_000_000
-SEARCH: Final = 2_000_000_000
 
 
 def held_out(task: str, seed: int, episode: int) -> Scenario:

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from egovcp.errors import UsageError
 from egovcp.sim.tasks.registry import seed_key
+
+# Added to the user's seed, so that no scenario serves two purposes; those of collections and of PPO
+# count from 0.
+HELD_OUT: Final = 1_000_000_000  # evaluation and deployment
+SEARCH: Final = 2_000_000_000  # for the best constant action
+VALIDATION: Final = 3_000_000_000  # during training
+STUDIES: Final = 4_000_000_000  # of egovcp-experiment
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,11 @@ from egovcp.model import WorldModel
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.plan import PlannerConfig
 from egovcp.plan.policy import Policy
+from egovcp.sim.scenario import VALIDATION, Scenario
 
 if TYPE_CHECKING:
     from egovcp.sim.base_env import BaseVectorEnv
-    from egovcp.sim.scenario import Scenario
 
-VALIDATION: Final = 3_000_000_000  # scenarios of neither a collection nor of egovcp-eval
 ROBOTS: Final = 8  # side by side
 
 type Played = tuple[NDArray[np.float64], NDArray[np.bool_]]
@@ -51,8 +50,6 @@ class ClosedLoop:
 
     def play(self, model: WorldModel, planner: PlannerConfig) -> dict[str, float]:
         """``TASK/return``, the mean sum of rewards, and ``TASK/success``, a share."""
-        from egovcp.sim.scenario import Scenario
-
         found: dict[str, float] = {}
         for task in self._tasks:
             every = [Scenario(task, VALIDATION + self._seed, i) for i in range(self._episodes)]

@@ -25,11 +25,10 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.base_env import Observation, StepResult
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.env import PrivilegedState, VectorEnv
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.scenario import STUDIES, Scenario
 from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_experiment.cell import RESULT
 
-_SEED: Final = 4_000_000_000  # added to seeds: no collection or evaluation has these scenarios
 _ENVS: Final = 8  # robots in parallel
 
 
@@ -138,7 +137,7 @@ def play_episodes(
     artifact: Artifact, env_config: EnvConfig, config: SimStudyConfig
 ) -> Iterator[PlayedStep]:
     """Play the scenarios of ``config`` in the scenes of ``env_config``, in groups of `_ENVS`."""
-    scenarios = [Scenario(config.task, _SEED + config.seed, i) for i in range(config.episodes)]
+    scenarios = [Scenario(config.task, STUDIES + config.seed, i) for i in range(config.episodes)]
     with tqdm(total=len(scenarios), unit="ep", desc=f"play {config.task}") as bar:
         for group in batched(scenarios, _ENVS):
             env = VectorEnv(env_config, len(group))

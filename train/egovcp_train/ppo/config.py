@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
 from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
 from egovcp.errors import UsageError
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
+from egovcp.sim.scenario import HELD_OUT
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
 from egovcp.spec import GAMMA
 from egovcp_train.on_policy import RslRlPpoConfig
-
-HELD_OUT: Final = 1_000_000_000  # seeds from here on are those of egovcp-eval
 
 
 @dataclass(frozen=True)
