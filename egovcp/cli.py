@@ -28,7 +28,7 @@ from egovcp.files import write_text
 from egovcp.flags import HELP, flag_values, merged, split_flags
 from egovcp.help_text import help_text
 from egovcp.outputs import check_output_files
-from egovcp.terminal import echo, one_line
+from egovcp.terminal import echo, one_line, without_token
 from egovcp.values import WrongValue, build
 
 type Defaults = Callable[[Sequence[str]], Mapping[str, Any]]
@@ -187,22 +187,12 @@ def _user_error(error: OSError | UnicodeEncodeError) -> EgovcpError | None:
 def report_error(prog: str, error: EgovcpError, debug: bool = False) -> int:
     """Print the error as one line, after its traceback if ``debug``; return its exit code."""
     if debug:
-        echo(_without_token(traceback.format_exc()), end="", error=True)
+        echo(without_token(traceback.format_exc()), end="", error=True)
     message = one_line(error)
     if len(message) > _MESSAGE_LIMIT:
         message = f"{message[:_MESSAGE_LIMIT]}..."
     echo(f"{prog}: error: {message}", error=True)
     return error.exit_code
-
-
-def _without_token(text: str) -> str:
-    """The text without the user's Hub token, which the answer of a server may contain."""
-    if "huggingface_hub" not in sys.modules:
-        return text
-    from huggingface_hub import get_token
-
-    token = get_token()
-    return text.replace(token, "<token>") if token else text
 
 
 def save_config(config: Any, path: str) -> None:

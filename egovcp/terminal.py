@@ -74,3 +74,13 @@ def discard_output() -> None:
 
 def _escaped(character: str) -> str:
     return character.encode("unicode_escape", "surrogatepass").decode("ascii")
+
+
+def without_token(text: str) -> str:
+    """The text without the user's Hub token, which the answer of a server may contain."""
+    if "huggingface_hub" not in sys.modules:
+        return text
+    from huggingface_hub import get_token
+
+    token = get_token()
+    return text.replace(token, "<token>") if token else text

@@ -10,6 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from egovcp.errors import ArtifactError, DataError, EgovcpError, EnvironmentFailure, UsageError
+from egovcp.terminal import without_token
 
 if TYPE_CHECKING:
     from huggingface_hub.errors import HfHubHTTPError
@@ -164,7 +165,7 @@ def _refusal(error: HfHubHTTPError, name: str, writing: bool, repo_type: RepoTyp
             f"another client has published to {name} in the meantime; nothing was published; check "
             "that version, then push again"
         )
-    message = _redacted(error.server_message or "").splitlines()
+    message = without_token(error.server_message or "").splitlines()
     reason = f": {message[0]}" if message else ""
     return EnvironmentFailure(
         f"the Hub answers {status} {error.response.reason_phrase} at {path}{reason}; try again "
@@ -187,13 +188,5 @@ def describe(error: BaseException) -> str:
 def _line(error: BaseException) -> str:
     if isinstance(error, json.JSONDecodeError):
         return "it is not JSON"
-    lines = _redacted(str(error)).strip().splitlines()
+    lines = without_token(str(error)).strip().splitlines()
     return lines[0] if lines else type(error).__name__
-
-
-def _redacted(text: str) -> str:
-    """The text without the user's token, which a server may have repeated."""
-    import huggingface_hub
-
-    found = huggingface_hub.get_token()
-    return text.replace(found, "<token>") if found else text
