@@ -2,10 +2,10 @@
 
 The return of one recorded action is a noisy target: later random actions and chance decide most of
 it. But the data also holds the position of the task's object (`egovcp.data.privileged`), from which
-a small network learns the value of planned actions within minutes (`egovcp_train.privileged_value`).
-Its predictions are the target of Q(h, z, a), which sees only what the robot sees (an asymmetric
-critic; Pinto et al. 2018, Chen et al. 2020). It also predicts the value of actions that were not
-taken, so Q is fitted to several actions per state.
+a small network learns the value of planned actions (`egovcp_train.privileged_value`). Its
+predictions are the target of Q(h, z, a), which sees only what the robot sees (an asymmetric critic;
+Pinto et al. 2018, Chen et al. 2020). It also predicts the value of actions that were not taken, so
+Q is fitted to several actions per state.
 """
 
 from __future__ import annotations
