@@ -139,7 +139,7 @@ def test_ppo_learns_what_a_term_rewards():
         CurriculumConfig(),
     )
     torch.manual_seed(0)
-    for _ in range(12):
+    for _ in range(18):
         scalars = learner.iterate()
     assert scalars["ppo/action_std"] < 0.98 * NetworkConfig().initial_std
 
