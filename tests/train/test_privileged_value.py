@@ -22,7 +22,7 @@ from egovcp_train.train import main
 
 type Arguments = Callable[..., list[str]]
 
-_CONFIG = PrivilegedValueConfig(updates=300, rows=64, lr=3e-3)
+_CONFIG = PrivilegedValueConfig(updates=600, rows=128, lr=3e-3)
 _PLANNER = PlannerConfig()
 
 
@@ -129,6 +129,10 @@ def test_rows_are_followed_by_their_next_row_and_half_are_mirrored(store: Episod
     now, reward, then, failed = rows.sample(4000, torch.Generator().manual_seed(0))
     index = reward.long()
     own = (now.action == rows.inputs.action[index]).all(-1)
+    error = (now.features - rows.inputs.features[index])[own]
+    assert torch.allclose(error, (then.features - rows.inputs.features[index + 1])[own], atol=1e-5)
+    assert error[:, spec.OBJECT_STATE].std() == pytest.approx(0.1, abs=0.01)
+    assert not error[:, spec.OBJECT_KNOWN :].any()
     assert torch.equal(now.action[~own], rows.mirrored.action[index[~own]])
     assert float(own.float().mean()) == pytest.approx(0.5, abs=0.05)
     assert torch.equal(then.action[own], rows.inputs.action[index[own] + 1])

@@ -37,6 +37,9 @@ _MIN_STD: Final = 1e-3
 _ROWS_AT_ONCE: Final = 1 << 16
 _SAMPLED: Final = 14  # next actions besides holding the last one and moving to the neutral pose
 _TARGET_DECAY: Final = 0.98
+#: Standard deviation of errors of position, m, and velocity, m/s. Planned actions then leave the
+#: margin that a policy needs, which only sees images.
+_OBJECT_NOISE: Final = 0.1
 
 
 class Inputs(NamedTuple):
@@ -85,7 +88,8 @@ class Transitions:
     def sample(
         self, count: int, generator: torch.Generator
     ) -> tuple[Inputs, Tensor, Inputs, Tensor]:
-        """Rows drawn at random, half of them mirrored.
+        """Rows drawn at random, half of them mirrored, with an error of the object's position and
+        velocity that is the same in both rows.
 
         Returns:
             inputs of the rows; their rewards (n,); inputs of the next rows; which rows ended in a
@@ -97,6 +101,11 @@ class Transitions:
         flip = torch.rand(count, generator=generator, device=device)[:, None] < 0.5
         later = (index + 1).clamp(max=len(self.reward) - 1)
         now, then = (self.inputs.at(rows, self.mirrored, flip) for rows in (index, later))
+        error = torch.zeros_like(now.features)
+        error[:, spec.OBJECT_STATE] = _OBJECT_NOISE * torch.randn(
+            (count, 6), generator=generator, device=device
+        )
+        now, then = (x._replace(features=x.features + error) for x in (now, then))
         return now, self.reward[index], then, self.failed[index]
 
 
@@ -147,6 +156,8 @@ def fit(
         value = PrivilegedValue(features.shape[-1], model.robot).to(device)
     value.mean.copy_(features.mean(0))
     value.std.copy_(features.std(0).clamp_min(_MIN_STD))
+    seen = value.std[spec.OBJECT_STATE]
+    seen.copy_((seen.square() + _OBJECT_NOISE**2).sqrt())
     target = copy.deepcopy(value).requires_grad_(False)
     parameters = list(value.parameters())
     optimizer = torch.optim.AdamW(parameters, lr=config.lr, weight_decay=_WEIGHT_DECAY, fused=True)

@@ -73,7 +73,7 @@ def test_without_a_privileged_value_the_target_is_the_return() -> None:
     assert torch.equal(found.usable, batch.mc_valid)
 
 
-@pytest.mark.parametrize(("q_target", "count"), [("privileged", 3), ("mc", 0), ("td", 0)])
+@pytest.mark.parametrize(("q_target", "count"), [("privileged", 7), ("mc", 0), ("td", 0)])
 def test_actions_are_sampled_for_the_privileged_value_only(q_target: str, count: int) -> None:
     loss = dataclasses.replace(DEBUG.loss, q_target=q_target)  # type: ignore[arg-type]
     model, batch = WorldModel(dataclasses.replace(DEBUG, loss=loss)), random_batch(2, 5)
