@@ -25,7 +25,7 @@ from egovcp_train.records import WandbConfig
 class PrivilegedValueConfig:
     """Fit of the target of Q, see `egovcp_train.privileged_value`."""
 
-    updates: int = bounded(14_000, least=1, most=10_000_000)
+    updates: int = bounded(5000, least=1, most=10_000_000)
     """Updates before the training of the world model."""
     rows: int = bounded(512, least=1, most=1_000_000)
     """Rows of an update."""
