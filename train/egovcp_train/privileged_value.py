@@ -56,7 +56,7 @@ class Inputs(NamedTuple):
 
 
 class Transitions:
-    """Inputs and standardised rewards of the N rows of episodes, and which rows have a successor.
+    """Inputs and rewards of the N rows of episodes, and which rows have a successor.
 
     The mirrored inputs of a robot that is not symmetric are its inputs.
     """

@@ -352,8 +352,8 @@ def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
         UsageError: the windows or the number of processes have changed.
     """
     state, stream = load_training_state(output), data.stream
-    require_same_content(data.readers, state["datasets"])
     with restoring(output):
+        require_same_content(data.readers, state["datasets"])
         learner.load_state_dict(state["learner"])
         streams = state["streams"]
         stream.load_state_dict(streams[min(learner.group.rank, len(streams) - 1)])
