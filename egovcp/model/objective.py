@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from egovcp.model import losses
-from egovcp.model.latent_state import Gaussian
+from egovcp.model.latent_state import Carry, Gaussian
 from egovcp.model.losses import Batch, Rollout
 from egovcp.model.multistep import (
     autoregressive_horizons,
@@ -87,8 +87,9 @@ def world_model_gradients(
     draws: StepNoise,
     critic: nn.Module | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
-) -> tuple[Tensor, Terms]:
-    """`world_model_loss`, detached; the gradient replaces the ``grad`` of the model's parameters.
+) -> tuple[Tensor, Terms, Carry]:
+    """`world_model_loss` and the filtered states (B, T, ...), detached; the gradient replaces the
+    ``grad`` of the model's parameters.
 
     Never synchronises with a GPU.
 
@@ -128,7 +129,7 @@ def world_model_gradients(
     known = [(x, g) for x, g in zip(2 * ends, gradients + others, strict=True) if g is not None]
     torch.autograd.backward([x for x, _ in known], [g for _, g in known])  # adds up each end's
     terms |= more
-    return _sum(terms).detach(), _named(terms)
+    return _sum(terms).detach(), _named(terms), rollout.carry.map(Tensor.detach)
 
 
 def _term_groups(

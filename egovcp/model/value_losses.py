@@ -60,10 +60,7 @@ class TargetNetwork(nn.Module):
 def td_target(
     model: WorldModel, carry: Carry, batch: Batch, head: SplitMlp | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Targets (B, T) in units of return, and the rows that have one.
-
-    The last row of a window, or of an episode ended by the time limit, has no target, because the
-    next state is unknown. The row of a failure needs no next state.
+    """Targets (B, T) in units of return, and the rows that have one; see `bootstrapped`.
 
     Args:
         model: the world model.
@@ -73,8 +70,17 @@ def td_target(
     """
     if head is None:
         head = model.value_head
-    later = F.pad(model.value_by(head, carry, batch.action)[:, 1:], (0, 1))
-    later = later.masked_fill(batch.terminal_next, 0.0)
+    return bootstrapped(model, batch, model.value_by(head, carry, batch.action))
+
+
+def bootstrapped(model: WorldModel, batch: Batch, values: Tensor) -> tuple[Tensor, Tensor]:
+    """r_t + gamma V_{t+1} (B, T) from values V_t (B, T) in units of return, and the rows that have
+    one.
+
+    The last row of a window, or of an episode ended by the time limit, has none, because the next
+    state is unknown. The row of a failure needs no next state.
+    """
+    later = F.pad(values[:, 1:], (0, 1)).masked_fill(batch.terminal_next, 0.0)
     known = F.pad(unbroken(batch, 1), (0, 1)) | batch.terminal_next
     return batch.reward + model.discount * later, batch.valid & known
 

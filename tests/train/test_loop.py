@@ -1,5 +1,6 @@
 """One optimiser step, the schedule and the budget."""
 
+import copy
 import dataclasses
 import itertools
 from typing import Any, Literal
@@ -10,9 +11,12 @@ import torch
 from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import PRESETS, Batch
+from egovcp.model.privileged_value import PrivilegedValue
+from egovcp.plan import PlannerConfig
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.loop import Budget, Learner
+from egovcp_train.privileged_value import Critic
 from tests.support.cuda_graphs import RecomputingCapture
 
 CONFIG = OptimizerConfig(warmup_steps=0)
@@ -20,6 +24,15 @@ CONFIG = OptimizerConfig(warmup_steps=0)
 
 def _learner(config: OptimizerConfig = CONFIG) -> Learner:
     return Learner(toy_model(), config, seed=0)
+
+
+def _with_critic(seed: int = 0) -> Learner:
+    learner = Learner(toy_model(seed=seed), CONFIG, seed=seed)
+    torch.manual_seed(seed)
+    learner.critic = Critic(
+        PrivilegedValue(random_batch(2, 3).privileged.shape[-1]), PlannerConfig(), lr=1e-3
+    )
+    return learner
 
 
 def _weights(learner: Learner) -> dict[str, torch.Tensor]:
@@ -81,7 +94,7 @@ def test_a_seed_repeats_the_updates_bit_for_bit() -> None:
 
 
 def test_the_state_restores_a_learner_bit_for_bit() -> None:
-    straight, stopped, other = _learner(), _learner(), Learner(toy_model(seed=5), CONFIG, seed=9)
+    straight, stopped, other = _with_critic(), _with_critic(), _with_critic(seed=9)
     for seed in range(2):
         straight.update(random_batch(2, 3, seed), 0.0)
         stopped.update(random_batch(2, 3, seed), 0.0)
@@ -92,6 +105,28 @@ def test_the_state_restores_a_learner_bit_for_bit() -> None:
     assert _same(_weights(straight), _weights(other))
     assert _same(straight.averaged.state_dict(), other.averaged.state_dict())
     assert straight.step == other.step == 4
+    assert straight.critic is not None
+    assert other.critic is not None
+    assert _same(straight.critic.value.state_dict(), other.critic.value.state_dict())
+
+
+def test_the_critic_is_trained_too() -> None:
+    learner = _with_critic()
+    assert learner.critic is not None
+    before = {k: v.clone() for k, v in learner.critic.value.state_dict().items()}
+    assert learner.update(random_batch(2, 3), 0.0)["loss/critic"] > 0
+    assert not _same(before, learner.critic.value.state_dict())
+
+
+def test_a_step_with_a_bad_reward_changes_neither_model_nor_critic() -> None:
+    learner, batch = _with_critic(), random_batch(2, 3)
+    assert learner.critic is not None
+    learner.update(batch, 0.0)
+    before, value = _weights(learner), copy.deepcopy(learner.critic.value.state_dict())
+    batch.reward[0, 0] = torch.nan
+    learner.update(batch, 0.0)
+    assert _same(before, _weights(learner))
+    assert _same(value, learner.critic.value.state_dict())
 
 
 # --- recorded steps -------------------------------------------------------------------------

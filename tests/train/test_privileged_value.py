@@ -11,13 +11,14 @@ import torch
 from egovcp import spec
 from egovcp.data import EpisodeIndex, EpisodeStore, open_dataset
 from egovcp.model import WorldModel
-from egovcp.model.privileged_value import PrivilegedValue
+from egovcp.model.losses import filter_sequence
+from egovcp.model.privileged_value import PrivilegedValue, sample_actions
 from egovcp.plan import PlannerConfig
-from egovcp.testing import toy_model
+from egovcp.testing import random_batch, toy_model
 from egovcp_train import privileged_value
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import PrivilegedValueConfig
-from egovcp_train.privileged_value import Transitions
+from egovcp_train.privileged_value import Critic, Transitions
 from egovcp_train.train import main
 
 type Arguments = Callable[..., list[str]]
@@ -57,42 +58,90 @@ def _changes(value: PrivilegedValue, rows: Transitions, column: int, by: float) 
     state, features, action = (x[:50] for x in rows.inputs)
     other = action.clone()
     other[:, column] += by
-    return value(state, features, other) - value(state, features, action)
+    return (value(state, features, other) - value(state, features, action)).detach()
 
 
 def test_without_a_future_it_is_the_reward_of_object_and_action(store: EpisodeStore) -> None:
     store, model = _rewarded(store), _model()
-    value = privileged_value.fit(model, store, _CONFIG, _PLANNER, seed=0)
+    value = privileged_value.fit(model, store, _CONFIG, _PLANNER, seed=0).value
     rows = Transitions(model, store)
-    reward = value(*rows.inputs)
+    reward = value(*rows.inputs).detach()
     assert float((reward - rows.reward).square().mean() / rows.reward.var()) < 0.1
     assert float(_changes(value, rows, 6, 0.3).mean()) == pytest.approx(-0.3, abs=0.1)
 
 
-def test_next_actions_are_those_of_the_planner(store: EpisodeStore) -> None:
+def test_next_actions_are_those_of_the_planner() -> None:
     """Within the rate limit, at the cost of a change, a lower command is better."""
-    inputs = Transitions(_model(), store).inputs
-    previous = torch.zeros(len(inputs.action), 7)
+    previous = torch.zeros(40, 7)
+    sampled = sample_actions(previous[:, None], 14, torch.Generator().manual_seed(0))[:, 0]
+    actions = privileged_value._candidates(previous, sampled)
+    returns = -actions[..., 6]
 
-    class Lower(PrivilegedValue):
-        def forward(
-            self, state: torch.Tensor, privileged: torch.Tensor, action: torch.Tensor
-        ) -> torch.Tensor:
-            return -action[..., 6]
+    def chosen(planner: PlannerConfig) -> torch.Tensor:
+        best = Critic(PrivilegedValue(3), planner, lr=1e-3)._best(returns, actions, previous)
+        return actions[torch.arange(40), best]
 
-    value = Lower(inputs.features.shape[-1])
-    generator = torch.Generator().manual_seed(0)
+    free = chosen(PlannerConfig(pose_cost=0.0, action_rate_cost=0.0))
+    assert float(free[:, 6].max()) < 0.0
+    assert float(free.abs().max()) <= spec.ACTION_RATE_LIMIT + 1e-6
+    assert float(free[:, 6].mean()) < -0.7 * spec.ACTION_RATE_LIMIT
+    assert not chosen(PlannerConfig(pose_cost=0.0, action_rate_cost=1e6)).any()  # it holds
 
-    def planned(planner: PlannerConfig) -> torch.Tensor:
-        return privileged_value._planned_value(
-            _model(), value, inputs, previous, planner, generator
-        )
 
-    free = planned(PlannerConfig(pose_cost=0.0, action_rate_cost=0.0))
-    assert float(free.min()) > 0.0
-    assert float(free.max()) <= spec.ACTION_RATE_LIMIT + 1e-6
-    assert float(free.mean()) > 0.7 * spec.ACTION_RATE_LIMIT
-    assert not planned(PlannerConfig(pose_cost=0.0, action_rate_cost=1e6)).any()  # it holds
+def test_while_a_model_is_trained_its_q_chooses_the_next_action(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The target is r + gamma V'(s', a'), with a' the best by the model of all candidates."""
+    monkeypatch.setattr(privileged_value, "_OBJECT_ERROR", 0.0)
+    model, batch = toy_model().requires_grad_(False), random_batch(2, 5)
+    model.discount.fill_(0.9)
+    batch.terminal_next[0, 1] = True
+    batch.valid[1, 3:] = False
+    torch.manual_seed(0)
+    value = PrivilegedValue(batch.privileged.shape[-1])
+    torch.nn.init.normal_(value.network.rest[-1].weight)  # type: ignore[arg-type]
+    planner = PlannerConfig(pose_cost=0.0, action_rate_cost=0.0)
+    critic = Critic(value, planner, lr=1e-3)
+    states = filter_sequence(model, batch).carry
+    sampled = sample_actions(batch.prev_action, 5, torch.Generator().manual_seed(0))
+    found = critic.compute_gradients(model, batch, states, sampled)
+
+    def error(b: int, t: int) -> torch.Tensor:
+        k, later = t + 1, torch.zeros(())
+        if (b, t) != (0, 1):  # which failed
+            actions = privileged_value._candidates(
+                batch.prev_action[b, k], batch.action[b, k][None], sampled[b, k]
+            )
+            carry = states.map(lambda x: x[b, k].expand(len(actions), -1))
+            best = actions[model.value(carry, actions).argmax()]
+            later = value(state[b, k], batch.privileged[b, k], best) * model.return_std
+            later = later + model.return_mean
+        expected = (batch.reward[b, t] + 0.9 * later - model.return_mean) / model.return_std
+        return (
+            value(state[b, t], batch.privileged[b, t], batch.action[b, t]) - expected.detach()
+        ) ** 2
+
+    state = model.standardise(batch.state)
+    with_successor = [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0), (1, 1)]
+    loss = torch.stack([error(b, t) for b, t in with_successor]).mean()
+    torch.testing.assert_close(found, loss.detach())
+    expected = torch.autograd.grad(loss, critic.parameters)
+    for parameter, gradient in zip(critic.parameters, expected, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-3)
+
+
+def test_the_target_network_follows_the_value() -> None:
+    critic = Critic(PrivilegedValue(3), _PLANNER, lr=1e-2)
+    before = [x.clone() for x in critic._target.parameters()]
+    for parameter in critic.parameters:
+        parameter.grad = torch.ones_like(parameter)
+    for _ in range(300):
+        critic.step()
+    moved = zip(critic._target.parameters(), critic.parameters, before, strict=True)
+    for target, own, old in moved:
+        assert (own < old).all()
+        assert (own < target).all()
+        assert (target < old).all()
 
 
 @pytest.mark.parametrize("failed", [False, True])
@@ -102,8 +151,8 @@ def test_after_a_failure_nothing_is_expected(store: EpisodeStore, failed: bool) 
     ended = np.full(store.num_frames, failed)
     store = dataclasses.replace(store, reward=ones, terminal_next=ended)
     config = PrivilegedValueConfig(updates=150, rows=32, lr=3e-3)
-    value = privileged_value.fit(_model(0.5), store, config, _PLANNER, seed=0)
-    expected = value(*Transitions(_model(), store).inputs).mean()
+    value = privileged_value.fit(_model(0.5), store, config, _PLANNER, seed=0).value
+    expected = value(*Transitions(_model(), store).inputs).detach().mean()
     assert float(expected) == pytest.approx(1.0 if failed else 2.0, abs=0.1)
 
 
@@ -113,7 +162,7 @@ def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: Episode
     expected = torch.rand(3)
     torch.manual_seed(5)
     first, second, other = (
-        privileged_value.fit(model, _rewarded(store), config, _PLANNER, seed).state_dict()
+        privileged_value.fit(model, _rewarded(store), config, _PLANNER, seed).value.state_dict()
         for seed in (0, 0, 1)
     )
     assert torch.equal(torch.rand(3), expected)
@@ -129,7 +178,9 @@ def test_rows_are_followed_by_their_next_row_and_half_are_mirrored(store: Episod
     own = (now.action == rows.inputs.action[index]).all(-1)
     error = (now.features - rows.inputs.features[index])[own]
     assert torch.allclose(error, (then.features - rows.inputs.features[index + 1])[own], atol=1e-5)
-    assert error[:, spec.OBJECT_STATE].std() == pytest.approx(0.1, abs=0.01)
+    std = error[:, spec.OBJECT_STATE].std(0)
+    expected = privileged_value._OBJECT_ERROR * rows.model.object_std
+    torch.testing.assert_close(std, expected, rtol=0.1, atol=0)
     assert not error[:, spec.OBJECT_KNOWN :].any()
     assert torch.equal(now.action[~own], rows.mirrored.action[index[~own]])
     assert float(own.float().mean()) == pytest.approx(0.5, abs=0.05)
@@ -150,24 +201,23 @@ def test_every_dataset_must_know_its_objects(store: EpisodeStore) -> None:
 
 
 @pytest.mark.parametrize("mode", ["ram", "stream"])
-def test_a_run_fits_it_once_and_keeps_it(
+def test_a_run_fits_it_once_and_trains_it_further(
     mode: str, arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
     assert main(arguments(run, steps=2, loading__mode=mode)) == 0
     assert "privileged value: correlation" in capsys.readouterr().out
-    before = load_training_state(run)["learner"]["privileged_value"]
+    before = load_training_state(run)["learner"]["critic"]
     assert main([f"--output_dir={run}", "--resume", "--steps=4"]) == 0
     assert "privileged value: correlation" not in capsys.readouterr().out
-    after = load_training_state(run)["learner"]["privileged_value"]
-    assert before.keys() == after.keys()
-    assert all(torch.equal(before[name], after[name]) for name in before)
+    after = load_training_state(run)["learner"]["critic"]
+    assert after["updates"] == before["updates"] + 2
 
 
 @pytest.mark.parametrize("q_target", ["mc", "td"])
 def test_other_targets_do_without(q_target: str, arguments: Arguments, tmp_path: Path) -> None:
     assert main(arguments(tmp_path / "run", steps=2, policy__loss__q_target=q_target)) == 0
-    assert "privileged_value" not in load_training_state(tmp_path / "run")["learner"]
+    assert "critic" not in load_training_state(tmp_path / "run")["learner"]
 
 
 def test_data_without_objects_falls_back_to_returns(
@@ -179,4 +229,4 @@ def test_data_without_objects_falls_back_to_returns(
     monkeypatch.setattr(privileged_value, "has_objects", lambda store: False)
     assert main(arguments(tmp_path / "run", steps=2)) == 0
     assert "the data has no positions of objects: Q is fitted to returns" in capsys.readouterr().out
-    assert "privileged_value" not in load_training_state(tmp_path / "run")["learner"]
+    assert "critic" not in load_training_state(tmp_path / "run")["learner"]

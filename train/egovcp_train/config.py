@@ -31,6 +31,8 @@ class PrivilegedValueConfig:
     """Rows of an update."""
     lr: float = bounded(1e-3, above=0)
     """Learning rate at the start; it decays to 0."""
+    training_lr: float = bounded(3e-4, above=0)
+    """Learning rate while the world model is trained."""
 
 
 @dataclass(frozen=True)

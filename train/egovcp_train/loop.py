@@ -10,29 +10,31 @@ from functools import partial
 from typing import Any, Final
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
+from egovcp.model.latent_state import Carry
 from egovcp.model.parallel import data_parallel
-from egovcp.model.privileged_value import PrivilegedValue
 from egovcp.model.value_losses import TargetNetwork
+from egovcp.plan import PlannerConfig
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.distributed import SINGLE, ProcessGroup
+from egovcp_train.privileged_value import Critic
 
 _MOST_GRAPHS: Final = 64
 """One for each row or image that may be the first (`egovcp.model.StepNoise`): 8 of the default."""
 _MAX_SKIPPED: Final = 3  # steps in a row whose loss or gradient is not finite
 
-type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
-"""Names and values (n,) of the terms, and the gradients of all parameters."""
+type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...], Carry]
+"""Names and values (n,) of the terms, the gradients of all parameters, the filtered states."""
 
 
 class Learner:
-    """Model, averaged model, optimiser, the random stream of the steps, and the network that
-    predicts the target of Q: the privileged value, or under ``q_target=td`` the target network.
+    """Model, averaged model, optimiser, the random stream of the steps, and what predicts the
+    target of Q: the critic, or under ``q_target=td`` the target network.
 
     A step has about a thousand small kernels. On a GPU it is launch-bound, so its gradient is
     captured as a CUDA graph (`egovcp.cuda_graphs`).
@@ -45,14 +47,19 @@ class Learner:
         seed: int,
         group: ProcessGroup = SINGLE,
         bf16: bool = False,
-        privileged_value: PrivilegedValue | None = None,
+        planner: PlannerConfig | None = None,
     ) -> None:
-        """All processes of ``group`` start from the same ``model`` and ``seed``."""
+        """All processes of ``group`` start from the same ``model`` and ``seed``.
+
+        Args:
+            planner: costs of the actions that the critic plans.
+        """
         self.model = model
         self.config = config
         self.group = group
         self.bf16 = bf16
-        self.privileged_value = privileged_value
+        self.planner = planner or PlannerConfig()
+        self.critic: Critic | None = None
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.target = TargetNetwork(model) if model.config.loss.q_target == "td" else None
         self.optimizer = torch.optim.AdamW(
@@ -82,28 +89,42 @@ class Learner:
             group["lr"] = lr
         with data_parallel(self.group.share):
             noise = sample_step_noise(self.model, batch, self.generator)
-            names, values, gradients = self._gradients(batch, noise)
+            names, values, gradients, states = self._gradients(batch, noise)
+            if self.critic:
+                error = self.critic.compute_gradients(
+                    self.model, batch, states, noise.actions, self.generator, self.bf16
+                )
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         terms = dict(zip(names, values.clone(), strict=True))
         terms = self.group.sum_gradients(self._parameters, terms)
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
-        if self._is_finite(norm + terms["loss/total"]):
+        total = norm + terms["loss/total"]
+        if self.critic:
+            found = self.group.sum_gradients(self.critic.parameters, {"loss/critic": error})
+            terms, total = terms | found, total + found["loss/critic"]
+        if self._is_finite(total):
             self.optimizer.step()
             self._average()
+            if self.critic:
+                self.critic.step()
             if self.target:
                 self.target.update(self.model, self.model.config.loss.td_decay)
         self.step += 1
         return {**terms, "grad_norm": norm}
 
     def _compute_gradients(self, batch: Batch, noise: StepNoise) -> Gradients:
-        critic = self.target.head if self.target else self.privileged_value
+        critic: nn.Module | None = self.target.head if self.target else None
+        if self.critic:
+            critic = self.critic.value
         in_precision = partial(precision, batch.state.device, self.bf16)
         with torch.enable_grad():
-            loss, terms = world_model_gradients(self.model, batch, noise, critic, in_precision)
+            loss, terms, states = world_model_gradients(
+                self.model, batch, noise, critic, in_precision
+            )
         terms = {**terms, "loss/total": loss}
         gradients = tuple(parameter.grad for parameter in self._parameters)
-        return tuple(terms), torch.stack(list(terms.values())), gradients
+        return tuple(terms), torch.stack(list(terms.values())), gradients, states
 
     def learning_rate(self, progress: float) -> float:
         """Linear warm-up, then cosine decay to a tenth of the peak."""
@@ -142,7 +163,6 @@ class Learner:
         torch._foreach_lerp_(means, values, 1 - decay)
 
     def state_dict(self) -> dict[str, Any]:
-        value = self.privileged_value
         return {
             "step": self.step,
             "model": self.model.state_dict(),
@@ -150,7 +170,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             **({"target": self.target.state_dict()} if self.target else {}),
-            **({"privileged_value": value.state_dict()} if value else {}),
+            **({"critic": self.critic.state_dict()} if self.critic else {}),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -161,11 +181,8 @@ class Learner:
         self.generator.set_state(state["generator"])
         if self.target:
             self.target.load_state_dict(state["target"])
-        if "privileged_value" in state:
-            self.privileged_value = PrivilegedValue.restore(
-                state["privileged_value"], self.model.robot
-            )
-            self.privileged_value.to(self.model.state_mean.device)
+        if "critic" in state:
+            self.critic = Critic.restore(state["critic"], self.model, self.planner)
 
 
 class Budget:

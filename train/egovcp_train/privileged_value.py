@@ -1,18 +1,23 @@
-"""Fit of the privileged value, before the world model is trained.
+"""Training of the privileged value, the critic of Q (`egovcp.model.privileged_value`).
 
-`egovcp.model.privileged_value` says what it is for. It is fitted Q iteration (Ernst et al. 2005):
-Q(s, a) is regressed on r + gamma Q(s', a'), where a' is the action that the planner would choose in
-s', the best of some sampled ones. So it is the value of planned actions, although those of the
-data are random. Returns of the data would be those of random actions, in which the effect of one
-action is small.
+Q(s, a) is regressed on r + gamma Q(s', a') (fitted Q iteration; Ernst et al. 2005), where a' is the
+best of some actions by the planner's J. So it is the value of planned actions, although those of
+the data are random. Returns of the data would be those of random actions, in which the effect of
+one action is small.
+
+Before the world model is trained, a' is the best by the privileged value itself (`fit`): a policy
+that knows where the object is, now and later. While it is trained, a' is the best by the Q of the
+world model, which sees images (`Critic.compute_gradients`): the value of the policy that is
+trained, and so of acting early where images leave the object's position open.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -22,8 +27,12 @@ from tqdm import tqdm
 from egovcp import spec
 from egovcp.data import EpisodeStore
 from egovcp.data.privileged import mirror_privileged
-from egovcp.model import WorldModel
+from egovcp.model import Batch, WorldModel
+from egovcp.model.latent_state import Carry
+from egovcp.model.losses import masked_mean
+from egovcp.model.parallel import row_noise
 from egovcp.model.privileged_value import PrivilegedValue, sample_actions
+from egovcp.model.value_losses import bootstrapped
 from egovcp.plan import PlannerConfig
 from egovcp.plan.search import action_costs
 from egovcp.terminal import echo
@@ -37,9 +46,10 @@ _MIN_STD: Final = 1e-3
 _ROWS_AT_ONCE: Final = 1 << 16
 _SAMPLED: Final = 14  # next actions besides holding the last one and moving to the neutral pose
 _TARGET_DECAY: Final = 0.98
-#: Standard deviation of errors of position, m, and velocity, m/s. Planned actions then leave the
-#: margin that a policy needs, which only sees images.
-_OBJECT_NOISE: Final = 0.1
+#: Standard deviation of errors of the object's position and velocity in what the critic is trained
+#: on, in units of `WorldModel.object_std` (G1: 0.11, 0.03 and 0.02 m, along x, y and z): about what
+#: images leave open, so that planned actions do not depend on more.
+_OBJECT_ERROR: Final = 0.12
 
 
 class Inputs(NamedTuple):
@@ -101,11 +111,10 @@ class Transitions:
         flip = torch.rand(count, generator=generator, device=device)[:, None] < 0.5
         later = (index + 1).clamp(max=len(self.reward) - 1)
         now, then = (self.inputs.at(rows, self.mirrored, flip) for rows in (index, later))
-        error = torch.zeros_like(now.features)
-        error[:, spec.OBJECT_STATE] = _OBJECT_NOISE * torch.randn(
-            (count, 6), generator=generator, device=device
+        noise = torch.randn((count, 6), generator=generator, device=device)
+        now, then = (
+            x._replace(features=_with_error(self.model, x.features, noise)) for x in (now, then)
         )
-        now, then = (x._replace(features=x.features + error) for x in (now, then))
         return now, self.reward[index], then, self.failed[index]
 
 
@@ -131,6 +140,143 @@ def has_objects(store: EpisodeStore) -> bool:
     return all(known[store.dataset == number].any() for number in np.unique(store.dataset))
 
 
+class Critic:
+    """The privileged value in training: network, target network and optimiser."""
+
+    def __init__(self, value: PrivilegedValue, planner: PlannerConfig, lr: float) -> None:
+        """
+        Args:
+            value: the network, which is trained in place.
+            planner: costs of the actions that it plans.
+            lr: learning rate.
+        """
+        self.value = value.requires_grad_()
+        self.parameters = list(value.parameters())
+        self._target = copy.deepcopy(value).requires_grad_(False)
+        self._one_step = replace(planner, horizon=1)
+        self._optimizer = torch.optim.AdamW(
+            self.parameters, lr=lr, weight_decay=_WEIGHT_DECAY, fused=True
+        )
+        self._updates = 0
+
+    @classmethod
+    def restore(cls, state: Mapping[str, Any], model: WorldModel, planner: PlannerConfig) -> Self:
+        """The critic that a ``state_dict`` describes, on the device of ``model``."""
+        value = PrivilegedValue.restore(state["value"], model.robot)
+        critic = cls(value.to(model.state_mean.device), planner, lr=0.0)
+        critic._target.load_state_dict(state["target"])
+        critic._optimizer.load_state_dict(state["optimizer"])
+        critic._updates = state["updates"]
+        return critic
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "value": self.value.state_dict(),
+            "target": self._target.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "updates": self._updates,
+        }
+
+    def set_learning_rate(self, lr: float) -> None:
+        for group in self._optimizer.param_groups:
+            group["lr"] = lr
+
+    def step(self) -> None:
+        """Update the network by the gradients of its parameters, then the target network."""
+        self._optimizer.step()
+        decay = min(_TARGET_DECAY, (1 + self._updates) / (10 + self._updates))  # fast at first
+        with torch.no_grad():
+            for own, new in zip(self._target.parameters(), self.parameters, strict=True):
+                own.lerp_(new, 1 - decay)
+        self._updates += 1
+
+    def compute_gradients(
+        self,
+        model: WorldModel,
+        batch: Batch,
+        states: Carry,
+        sampled: Tensor,
+        generator: torch.Generator | None = None,
+        bf16: bool = False,
+    ) -> Tensor:
+        """Mean squared error at the rows of a batch, whose gradient replaces those of the
+        parameters. The next action is the best by the Q of ``model``.
+
+        Args:
+            model: the world model.
+            batch: windows of episodes.
+            states: the filtered states (B, T, ...).
+            sampled: actions (B, T, K, 7), from which the next one is chosen, besides the recorded
+                one, holding the previous one and moving to the neutral pose.
+            generator: draws an error of the object's position and velocity for each window.
+            bf16: compute the Q of ``model`` with matrix products in bfloat16.
+        """
+        state = model.standardise(batch.state)
+        noise = row_noise((len(state), 1, 6), generator, state.device)
+        features = _with_error(model, batch.privileged, noise)
+        with torch.no_grad():
+            actions = _candidates(batch.prev_action, batch.action[:, :, None], sampled)
+            with precision(actions.device, bf16):
+                returns = model.value(states.map(lambda x: x[:, :, None]), actions)
+            best = self._best(returns.flatten(0, 1), actions.flatten(0, 1), batch.prev_action)
+            action = actions.flatten(0, 1)[torch.arange(len(best), device=best.device), best]
+            later = self._target(state, features, action.view_as(batch.action))
+            later = later * model.return_std + model.return_mean
+            expected, usable = bootstrapped(model, batch, later)
+            expected = (expected - model.return_mean) / model.return_std
+        squared = (self.value(state, features, batch.action) - expected).square()
+        return self._backward(masked_mean(squared, usable))
+
+    def fit_step(
+        self,
+        model: WorldModel,
+        rows: Transitions,
+        count: int,
+        generator: torch.Generator,
+        bf16: bool = False,
+    ) -> None:
+        """One update on ``count`` rows, whose next action is the best by this value itself."""
+        now, reward, then, failed = rows.sample(count, generator)
+        with torch.no_grad():
+            sampled = sample_actions(now.action[:, None], _SAMPLED, generator)[:, 0]
+            actions = _candidates(now.action, sampled)
+            with precision(actions.device, bf16):
+                later = self._target(then.state[:, None], then.features[:, None], actions)
+            later = later * model.return_std + model.return_mean
+            best = self._best(later, actions, now.action)
+            later = later.gather(1, best[:, None])[:, 0].masked_fill(failed, 0.0)
+            expected = (reward + model.discount * later - model.return_mean) / model.return_std
+        self._backward((self.value(*now) - expected).square().mean())
+        self.step()
+
+    def _best(self, returns: Tensor, actions: Tensor, previous: Tensor) -> Tensor:
+        """Indices (n,) of the best of actions (n, M, 7) by the planner's J, from the returns
+        (n, M) and the previous actions (..., 7)."""
+        start = previous.reshape(len(actions), 1, -1)
+        return (returns - action_costs(start, actions[:, :, None], self._one_step)).argmax(1)
+
+    def _backward(self, loss: Tensor) -> Tensor:
+        gradients = torch.autograd.grad(loss, self.parameters)
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        return loss.detach()
+
+
+def _with_error(model: WorldModel, features: Tensor, noise: Tensor) -> Tensor:
+    """Features (..., F) with an error of the object's position and velocity from standard normal
+    noise (..., 6)."""
+    changed = features.clone()
+    changed[..., spec.OBJECT_STATE] += _OBJECT_ERROR * model.object_std * noise
+    return changed
+
+
+def _candidates(previous: Tensor, *actions: Tensor) -> Tensor:
+    """The given actions (..., M_i, 7), the previous one (..., 7) again, and a step from it towards
+    the neutral pose, (..., M + 2, 7)."""
+    limit, hold = spec.ACTION_RATE_LIMIT, previous[..., None, :]
+    return torch.cat([*actions, hold, hold - hold.clamp(-limit, limit)], -2)
+
+
 def fit(
     model: WorldModel,
     store: EpisodeStore,
@@ -138,7 +284,7 @@ def fit(
     planner: PlannerConfig,
     seed: int,
     bf16: bool = False,
-) -> PrivilegedValue:
+) -> Critic:
     """Fit a value to the episodes of ``store``; shows its progress.
 
     Args:
@@ -157,57 +303,20 @@ def fit(
     value.mean.copy_(features.mean(0))
     value.std.copy_(features.std(0).clamp_min(_MIN_STD))
     seen = value.std[spec.OBJECT_STATE]
-    seen.copy_((seen.square() + _OBJECT_NOISE**2).sqrt())
-    target = copy.deepcopy(value).requires_grad_(False)
-    parameters = list(value.parameters())
-    optimizer = torch.optim.AdamW(parameters, lr=config.lr, weight_decay=_WEIGHT_DECAY, fused=True)
+    seen.copy_((seen.square() + (_OBJECT_ERROR * model.object_std).square()).sqrt())
+    critic = Critic(value, planner, config.lr)
     generator = torch.Generator(device=device).manual_seed(seed)
     for step in tqdm(range(config.updates), desc="privileged value", mininterval=1.0):
-        now, reward, then, failed = rows.sample(config.rows, generator)
-        with precision(device, bf16):
-            later = _planned_value(model, target, then, now.action, planner, generator)
-        expected = reward + model.discount * later.masked_fill(failed, 0.0)
-        for group in optimizer.param_groups:
-            group["lr"] = config.lr * 0.5 * (1 + math.cos(math.pi * step / config.updates))
-        optimizer.zero_grad()
-        loss = (value(*now) - (expected - model.return_mean) / model.return_std).square().mean()
-        loss.backward()
-        optimizer.step()
-        decay = min(_TARGET_DECAY, (1 + step) / (10 + step))  # fast at first
-        with torch.no_grad():
-            for own, new in zip(target.parameters(), parameters, strict=True):
-                own.lerp_(new, 1 - decay)
-    return value.requires_grad_(False)
-
-
-@torch.no_grad()
-def _planned_value(
-    model: WorldModel,
-    value: PrivilegedValue,
-    inputs: Inputs,
-    previous: Tensor,
-    planner: PlannerConfig,
-    generator: torch.Generator,
-) -> Tensor:
-    """Returns (n,) of the best of some actions after ``previous`` (n, 7), by the planner's J."""
-    limit = spec.ACTION_RATE_LIMIT
-    sampled = sample_actions(previous[:, None], _SAMPLED, generator)[:, 0]
-    hold = previous[:, None]
-    actions = torch.cat([sampled, hold, hold - hold.clamp(-limit, limit)], 1)  # (n, M, 7)
-    returns = (
-        value(inputs.state[:, None], inputs.features[:, None], actions) * model.return_std
-        + model.return_mean
-    )
-    one_step = replace(planner, horizon=1)
-    best = (returns - action_costs(hold, actions[:, :, None], one_step)).argmax(1, keepdim=True)
-    of_best: Tensor = returns.gather(1, best)[:, 0]
-    return of_best
+        critic.set_learning_rate(config.lr * 0.5 * (1 + math.cos(math.pi * step / config.updates)))
+        critic.fit_step(model, rows, config.rows, generator, bf16)
+    critic.set_learning_rate(config.training_lr)
+    return critic
 
 
 def prepare(
     model: WorldModel, data: TrainingData, group: ProcessGroup, bf16: bool = False
-) -> PrivilegedValue | None:
-    """Fit the target of Q of a run in its first process, and say how well it agrees with returns.
+) -> Critic | None:
+    """Fit the critic of a run in its first process, and say how well it agrees with returns.
 
     Returns:
         None if the target of Q is another one, also because the data lacks positions of objects.
@@ -219,9 +328,9 @@ def prepare(
         if group.is_first:
             echo("the data has no positions of objects: Q is fitted to returns")
         return None
-    state: dict[str, Tensor] = {}
+    critic = None
     if group.is_first:
-        value = fit(
+        critic = fit(
             model,
             data.learning(),
             config.optimizer.privileged_value,
@@ -229,10 +338,19 @@ def prepare(
             config.seed,
             bf16,
         )
-        found = correlation(model, data.heldout, value)
+        found = correlation(model, data.heldout, critic.value)
         echo(
             "privileged value: correlation with held-out returns: "
             + ", ".join(f"{k} {v:.2f}" for k, v in found.items())
         )
-        state = value.cpu().state_dict()
-    return PrivilegedValue.restore(group.broadcast(state), model.robot).to(model.state_mean.device)
+    if group.count == 1:
+        return critic
+    state = group.broadcast(_on_cpu(critic.state_dict()) if critic else {})
+    return Critic.restore(state, model, config.planner)
+
+
+def _on_cpu(tree: Any) -> Any:
+    """The same nested dictionaries with tensors in the memory of the CPU."""
+    if isinstance(tree, dict):
+        return {key: _on_cpu(value) for key, value in tree.items()}
+    return tree.cpu() if isinstance(tree, Tensor) else tree

@@ -110,12 +110,12 @@ def train(config: TrainConfig) -> None:
     config = data.config
     if initial:
         model.load_state_dict(initial)
-    learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16)
+    learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16, config.planner)
     if config.resume:
         spent = _restore(output, learner, data)
     else:
         start = time.monotonic()
-        learner.privileged_value = privileged_value.prepare(learner.model, data, group, bf16)
+        learner.critic = privileged_value.prepare(learner.model, data, group, bf16)
         spent = time.monotonic() - start  # it is part of --max_minutes
     provenance = _provenance(data)
     simulation = None
@@ -251,7 +251,8 @@ class TrainingRun:
         """Measure a model on held-out episodes, and in simulation if configured."""
         heldout = self.data.heldout
         episodes = episode_batches(heldout, self.device, EVALUATION_EPISODES)
-        report = measure(model, episodes, critic=self.learner.privileged_value)
+        critic = self.learner.critic
+        report = measure(model, episodes, critic=critic.value if critic else None)
         self.metrics, self.tasks = report.metrics, report.tasks
         if self.simulation is not None:
             self.played = self.simulation.play(model, self.config.planner)

@@ -17,7 +17,7 @@ pytestmark = [
 
 
 def _step(model: WorldModel, batch: Batch) -> tuple[dict[str, float], Tensor]:
-    total, terms = world_model_gradients(model, batch, sample_step_noise(model, batch))
+    total, terms, _ = world_model_gradients(model, batch, sample_step_noise(model, batch))
     gradients = [p.grad.flatten().cpu() for p in model.parameters() if p.grad is not None]
     named = {name: float(term) for name, term in {**terms, "total": total}.items()}
     return named, torch.cat(gradients)

@@ -145,7 +145,7 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures["squat"]["stepping_share"] == 0.0
     assert len(figures["squat"]["camera_px_per_step"]) == 3
     assert len(figures["squat"]["camera_px_8_steps"]) == 3
-    assert figures["_run"]["controller"] == make_controller("stance").id
+    assert figures["_run"]["controller"] == make_controller("walk").id
     out = capsys.readouterr().out
     assert "squat" in out
     rows = out[out.index("skill") : out.index("figures:")].splitlines()

@@ -62,8 +62,8 @@ class LowLevelEvalConfig:
 
     output_dir: str
     """Folder for lowlevel.json; its other files are left alone."""
-    controller: str = "stance"
-    """stance, walk (which the package ships), or the walk.safetensors of egovcp-train-lowlevel."""
+    controller: str = "walk"
+    """walk (which the package ships), stance, or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
     """Which skills, separated by commas."""
     episodes: int = bounded(400, least=1, most=1_000_000)
