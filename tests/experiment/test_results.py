@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egovcp.intervals import EvalScores
+from egovcp.eval_scores import EvalScores
 from egovcp_experiment.results import eval_scores
 
 

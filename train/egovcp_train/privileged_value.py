@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -59,6 +60,13 @@ class Inputs(NamedTuple):
     features: Tensor  # (n, F)
     action: Tensor  # (n, 7)
 
+    @classmethod
+    def of(cls, model: WorldModel, *arrays: NDArray[np.float32]) -> Self:
+        """Those of proprioception, features and actions, on the device of ``model``."""
+        device = model.state_mean.device
+        state, features, action = (torch.from_numpy(x).to(device) for x in arrays)
+        return cls(model.standardise(state), features, action)
+
     def at(self, index: Tensor, other: Inputs, flip: Tensor) -> Inputs:
         """Rows ``index`` (m,), of ``other`` where ``flip`` (m, 1)."""
         pairs = zip(self, other, strict=True)
@@ -73,21 +81,15 @@ class Transitions:
 
     def __init__(self, model: WorldModel, store: EpisodeStore) -> None:
         """Those of ``store``, on the device of ``model``, whose normalisation is used."""
-        self.model, device = model, model.state_mean.device
-        own = (store.state, store.privileged, store.action)
-        mirrored, robot = own, store.robot
+        self.model, device, robot = model, model.state_mean.device, store.robot
+        self.inputs = self.mirrored = Inputs.of(model, store.state, store.privileged, store.action)
         if robot.mirror is not None:
-            mirrored = (
+            self.mirrored = Inputs.of(
+                model,
                 robot.mirrored_state(store.state),
                 mirror_privileged(store.privileged),
                 robot.mirrored_action(store.action),
             )
-        self.inputs, self.mirrored = (
-            Inputs(model.standardise(state), *others)
-            for state, *others in (
-                (torch.from_numpy(x).to(device) for x in arrays) for arrays in (own, mirrored)
-            )
-        )
         self.reward = torch.from_numpy(store.reward).to(device)
         self.failed = torch.from_numpy(store.terminal_next).to(device)
         last = np.zeros(store.num_frames, np.bool_)
@@ -120,7 +122,7 @@ class Transitions:
 
 def correlation(model: WorldModel, store: EpisodeStore, value: PrivilegedValue) -> dict[str, float]:
     """Task -> correlation of a value with the returns of the episodes of ``store``."""
-    inputs = Transitions(model, store).inputs
+    inputs = Inputs.of(model, store.state, store.privileged, store.action)
     pieces = zip(*(torch.split(x, _ROWS_AT_ONCE) for x in inputs), strict=True)
     with torch.no_grad():
         expected = torch.cat([value(*piece) for piece in pieces]).cpu().numpy()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from egovcp.intervals import EvalScores
+from egovcp.eval_scores import EvalScores
 from egovcp.sim.tasks.sequence import SequenceTask
 from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results

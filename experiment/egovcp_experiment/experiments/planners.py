@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from egovcp.intervals import EvalScores
+from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, CellFigure, Flags
 from egovcp_experiment.config import ExperimentConfig

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from egovcp.errors import UsageError
-from egovcp.intervals import EvalScores
+from egovcp.eval_scores import EvalScores
 from egovcp.sim.config import evaluation_config
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath

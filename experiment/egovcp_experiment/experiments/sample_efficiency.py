@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from egovcp.intervals import EvalScores
+from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import TASKS, EpisodesConfig, ExperimentConfig

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from egovcp.intervals import EvalScores, Gain
+from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig

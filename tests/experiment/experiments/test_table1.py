@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.intervals import Gain
+from egovcp.eval_scores import Gain
 from egovcp_experiment.cell import ARTIFACT, PLAY, TRAIN, Cell, CellOutput
 from egovcp_experiment.config import SCALES, ExperimentConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS

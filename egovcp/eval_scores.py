@@ -1,0 +1,146 @@
+"""Scores of evaluated episodes, with 95 % intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.intervals import Interval, bootstrap, points_range, signed_range, wilson
+
+type Array = NDArray[np.float64]
+
+_TRIALS: Final = 10  # as in the paper
+
+
+class Gain(NamedTuple):
+    """Paired differences of two `EvalScores`, with 95 % intervals over scenarios."""
+
+    reward: float
+    """Per step."""
+    reward_interval: Interval
+    success: float
+    success_interval: Interval
+
+    def word(self, better: str = "better", worse: str = "worse", same: str = "undecided") -> str:
+        """By the interval of the reward."""
+        low, high = self.reward_interval
+        return better if low > 0 else worse if high < 0 else same
+
+    def columns(self) -> tuple[str, ...]:
+        """Success, percentage points, and reward per step, each with its interval."""
+        return (
+            f"{100 * self.success:+.1f}",
+            points_range(self.success_interval),
+            f"{self.reward:+.5f}",
+            signed_range(self.reward_interval),
+        )
+
+    def __str__(self) -> str:
+        success, success_range, reward, reward_range = self.columns()
+        return (
+            f"reward per step {reward}, 95 % {reward_range}; success {success} points, "
+            f"{success_range}"
+        )
+
+
+@dataclass(frozen=True)
+class EvalScores:
+    """Scores of S training seeds on the same E scenarios."""
+
+    reward: Array
+    """(S, E) sum over the episode."""
+    steps: Array
+    """(S, E) planner ticks."""
+    success: Array
+    """(S, E) 0 or 1."""
+    plan_ms: tuple[float, ...] = ()
+    """(S,) median time per plan and robot, ms."""
+    parts: Mapping[str, Array] = field(default_factory=dict)
+    """(S, E) 0 or 1 for each part of a sequence of tasks."""
+
+    @property
+    def success_rate(self) -> float:
+        """Mean over seeds and scenarios."""
+        return float(self.success.mean())
+
+    @property
+    def part_rates(self) -> dict[str, float]:
+        """Success rate of each part of a sequence."""
+        return {name: float(each.mean()) for name, each in self.parts.items()}
+
+    @property
+    def success_interval(self) -> Interval:
+        """95 %: Wilson for one seed, bootstrap over scenarios for several."""
+        if len(self.success) == 1:
+            return wilson(int(self.success.sum()), self.success.size)
+        return bootstrap(lambda i: _mean(self.success, i), self.success.shape[1])
+
+    @property
+    def reward_per_step(self) -> float:
+        """Sum of all rewards over sum of all steps."""
+        return float(self.reward.sum() / self.steps.sum())
+
+    @property
+    def reward_interval(self) -> Interval:
+        """95 %, bootstrap over scenarios."""
+        return bootstrap(self._reward_per_step, self.reward.shape[1])
+
+    @property
+    def reward_of_seeds(self) -> Array:
+        """(S,) reward per step of each training."""
+        each: Array = self.reward.sum(1) / self.steps.sum(1)
+        return each
+
+    @property
+    def reward_spread(self) -> float | None:
+        """Standard deviation of the reward per step over seeds; None for one seed."""
+        return float(np.std(self.reward_of_seeds, ddof=1)) if len(self.reward) > 1 else None
+
+    @property
+    def reward_trial_spread(self) -> float | None:
+        """Standard deviation of the reward per step over trials; None for a single scenario. A
+        trial is a tenth of the scenarios with one seed."""
+        count = min(_TRIALS, self.reward.shape[1])
+        if count < 2:
+            return None
+        parts = np.array_split(np.arange(self.reward.shape[1]), count)
+        trials = [self.reward[:, p].sum(1) / self.steps[:, p].sum(1) for p in parts]
+        return float(np.std(trials, ddof=1))
+
+    def _reward_per_step(self, i: NDArray[np.int64]) -> Array:
+        return _mean(self.reward, i) / _mean(self.steps, i)
+
+    def gain(self, other: EvalScores) -> Gain:
+        """Differences to ``other`` on the same scenarios."""
+        success = self.success.mean(0) - other.success.mean(0)
+        return Gain(
+            self.reward_per_step - other.reward_per_step,
+            bootstrap(lambda i: self._reward_per_step(i) - other._reward_per_step(i), len(success)),
+            float(success.mean()),
+            bootstrap(lambda i: success[i].mean(1), len(success)),
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "seeds": len(self.reward),
+            "episodes": self.reward.shape[1],
+            "success_rate": self.success_rate,
+            "success_ci95": list(self.success_interval),
+            "reward_mean": self.reward_per_step,
+            "reward_ci95": list(self.reward_interval),
+            "reward_sd_over_seeds": self.reward_spread,
+            "reward_sd_over_trials": self.reward_trial_spread,
+            "plan_ms_p50": list(self.plan_ms),
+            **({"parts": self.part_rates} if self.parts else {}),
+        }
+
+
+def _mean(values: Array, picks: NDArray[np.int64]) -> Array:
+    """(S, E) values -> (R,) means over seeds and the picked scenarios (R, E)."""
+    mean: Array = values.mean(0)[picks].mean(1)
+    return mean
