@@ -1,8 +1,9 @@
 """A gradient step in plain eager PyTorch, which `train_step.py` compares with.
 
-The same mathematics as `egovcp.model` and `egovcp_train.loop`: the same weights, loss terms and
-random draws, optimiser and averaging. Every network is a plain module on concatenated inputs, the
-encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time.
+The same mathematics as `egovcp.model` and `egovcp_train.loop` without a critic: the same weights,
+loss terms and random draws, optimiser and averaging. Every network is a plain module on
+concatenated inputs, the encoder and all heads work on whole stacked sequences, and the recurrence
+is a loop over time.
 """
 
 from __future__ import annotations

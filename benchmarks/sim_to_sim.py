@@ -119,7 +119,7 @@ def main() -> None:
         }
 
     print(f"controller {make_controller(args.controller).id}, {args.episodes} robots each")
-    print(f"{'survival, %':<15}" + "".join(f"{name[:8]:>7} " for name in args.skills))
+    print(f"{'survival, %':<15}" + "".join(f"{name[:7]:>7} " for name in args.skills))
     reference = measured(Variant())
     shares = {name: float(up.mean()) for name, up in reference.items()}
     print(row("reference", [100 * share for share in shares.values()], signed=False), flush=True)
@@ -137,7 +137,10 @@ def main() -> None:
         name = min(apart, key=lambda skill: apart[skill][0])
         points, (low, high) = apart[name]
         worst.append(f"{title:<15}{name:<10}{points:+.1f} ({low:+.1f} to {high:+.1f})")
-    print("worst skill of each variant, points:\n" + "\n".join(worst))
+    print(
+        "worst skill of each variant, points, with the interval of that skill alone:\n"
+        + "\n".join(worst)
+    )
     publish(published, args.json)
 
 

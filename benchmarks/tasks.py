@@ -4,10 +4,10 @@ Plays held-out scenarios of each task with `hold` (neutral pose), `constant` (th
 searched on other scenarios), `random` (the paper's random walk) and `oracle`, both bands of the
 arch's clearance among them, and the wall at one push speed after another with `hold` and `oracle`.
 Prints success and reward per step with 95 % intervals, falls, and the way: 0 % is the reward of
-`random`, 100 % that of `oracle`. A task is well set for a controller when hands at rest mostly fail
-and go at most half of the way, and the oracle almost always succeeds; the last line says for which
-pushes that is so. For the wall it also prints how often the oracle stands with free hands after the
-push. Run it whenever the controller changes, and put the range of pushes into `egovcp.sim.config`:
+`random`, 100 % that of `oracle`. The last line says for which pushes hands at rest mostly fail and
+the oracle almost always succeeds. For the wall it also prints how often the oracle stands with free
+hands after the push. Run it whenever the controller changes, and put the range of pushes into
+`egovcp.sim.config`:
 
     python benchmarks/tasks.py
     python benchmarks/tasks.py --tasks ball arch wall --pushes

@@ -18,7 +18,7 @@ from egovcp.sim.scenario import Scenario
 from egovcp_collect.workers import Backend, Worker, WorkerReport
 
 MAX_ATTEMPTS: Final = 3
-"""Workers that the same episode may end before the collection stops."""
+"""How many workers may die on the same episode before the collection stops."""
 _POLL_S: Final = 0.25
 
 
@@ -117,7 +117,8 @@ class WorkerPool:
         self._waiting.extendleft(reversed(worker.unfinished.values()))
 
     def _count_invalid(self, worker: _PoolWorker, cause: DataError) -> None:
-        """Raise if the invalid episode, or any of the worker if it is unknown, was so before."""
+        """Raise at the second invalid result of an episode. All unfinished episodes of the worker
+        count if the error does not name one."""
         suspects = [n for n in worker.unfinished if cause.episode in (None, n)]
         self._invalid.update(suspects)
         if not suspects or max(self._invalid[number] for number in suspects) > 1:

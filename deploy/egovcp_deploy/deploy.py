@@ -22,10 +22,10 @@ from egovcp_deploy.rollouts import play_rollouts, replay
 PROG: Final = "egovcp-deploy"
 _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
-    "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json, which "
-    "summarises the complete rollouts, also after an interrupt. On a robot the first Ctrl-C holds "
-    "it, the second damps its motors: a standing robot sinks. Exit code 6: the motors were damped "
-    "for safety."
+    "Writes rollout-<i>.mcap, rollout-<i>.rrd, pictures of the first rollouts, and deploy.json, "
+    "which summarises the complete rollouts, also after an interrupt. On a robot the first Ctrl-C "
+    "holds it, the second damps its motors: a standing robot sinks. Exit code 6: the motors were "
+    "damped for safety."
 )
 
 

@@ -317,10 +317,10 @@ class DatasetReader:
             if len(wrong):
                 at = int(wrong[0])
                 found = columns[name][at]
-                yield at, f"column {name} does not count: {found}, expected {expected[at]}"
-        late = ~(np.abs(columns["timestamp"] - frames / self.fps) <= _TIMESTAMP_SLACK)
-        if late.any():
-            at = int(np.argmax(late))
+                yield at, f"column {name} is {found}, expected {expected[at]}"
+        mistimed = ~(np.abs(columns["timestamp"] - frames / self.fps) <= _TIMESTAMP_SLACK)
+        if mistimed.any():
+            at = int(np.argmax(mistimed))
             found = columns["timestamp"][at]
             yield at, f"timestamp {found:g} s, expected {at / self.fps:g} at {self.fps} fps"
         own = [number for number, name in self.task_names.items() if name == self.task(index)]
@@ -354,9 +354,9 @@ def load_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Whole columns of a dataset of B episodes as (B, T, ...), T the longest episode's frames.
 
-    ``columns`` are keys of ``schema.FEATURES``. Frames after the end of an episode are zeros, and
-    False in the additional array ``valid`` (B, T). Depth takes 6 kB per frame: omit it from
-    ``columns`` if it is not needed.
+    ``columns`` are keys of ``schema.FEATURES``; by default all but indices and times. Frames after
+    the end of an episode are zeros, and False in the additional array ``valid`` (B, T). Depth takes
+    6 kB per frame: omit it from ``columns`` if it is not needed.
     """
     reader = dataset if isinstance(dataset, DatasetReader) else open_dataset(dataset)
     longest = int(reader.lengths.max())

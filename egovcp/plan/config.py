@@ -57,11 +57,12 @@ class PlannerConfig:
     """Cost of the pose per step, times the mean squared action; that of the data's reward."""
     action_parameterization: ActionParameterization = "target"
     """How a sample becomes actions. target: move towards one target at rate eta, then hold it, like
-    data collected with a longer --step_ticks; random_walk: an independent change at every step."""
+    the default data of egovcp-collect; random_walk: an independent change at every step."""
     termination_threshold: float = bounded(0.9, least=0, most=1)
     """A candidate is considered failed where its termination probability exceeds this."""
     termination_rule: TerminationRule = "shift"
-    """Value of a failed candidate. paper: zero from then on; shift: the lowest return of the data;
+    """Value of a failed candidate. paper: zero from then on; shift: a return below 99.9 % of those
+    of the data;
     survival: values above that are weighted by the probability of survival."""
     latent: Latent = "mean"
     """z of imagined states. mean: the mean of the prior; sample: a sample of it, with the same

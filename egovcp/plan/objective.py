@@ -37,7 +37,8 @@ class Dynamics[L](Protocol):
 
     @property
     def min_return(self) -> Tensor:
-        """Lowest return of the data: the value of a failed plan under rule ``shift``."""
+        """The 0.1 % quantile of the returns of the data, the value of a failed plan under rule
+        ``shift``."""
         ...
 
     def expand_candidates(self, carry: L) -> L:

@@ -177,7 +177,7 @@ def test_damage_that_is_met_under_way_ends_the_run(
         path.write_bytes(files[0].read_bytes())
     _publish(bad)
     assert main(streamed(tmp_path / "run", steps=20)) == 3
-    assert "column index does not count" in capsys.readouterr().err.splitlines()[-1]
+    assert "column index is " in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_only_the_episodes_asked_for_are_trained_on_and_named(

@@ -34,8 +34,7 @@ class AuditConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
     episodes: str = ""
-    """Which episodes: numbers, `[0, 7]`, a range whose end is excluded, `0:100`, or both; empty:
-    --count of them."""
+    """Which episodes: `[0, 7]`, `0:100` (without 100) or `[0:100, 250]`; empty: --count of them."""
     count: int = bounded(5, least=1)
     """How many episodes, spread evenly over the dataset."""
     json: str = output_file()

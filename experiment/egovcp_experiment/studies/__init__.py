@@ -1,1 +1,1 @@
-"""Studies of a trained policy: cells of this package, each also ``python -m MODULE``."""
+"""Studies of a trained policy; each runs as a cell of an experiment, or as ``python -m MODULE``."""

@@ -118,7 +118,7 @@ def _nan_at_20(rows: list) -> list:
             _edit_table("timestamp", lambda rows: [2 * t for t in rows]),
             "frame 1: timestamp 0.08 s",
         ),
-        (_edit_table("index", lambda rows: rows[::-1]), "column index does not count"),
+        (_edit_table("index", lambda rows: rows[::-1]), "column index is "),
         (
             _edit_table("task_index", lambda rows: [0] * len(rows)),
             "task is ball, .* wall",

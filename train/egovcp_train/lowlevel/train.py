@@ -120,16 +120,16 @@ def train(config: LowLevelTrainConfig) -> None:
     init = load_walk_policy(config.init) if config.init and not config.resume else None
     learner = _build(config, threads)
     spent = 0.0
-    if config.resume:
-        state = load_training_state(output)
-        spent = float(state["seconds"])
-        with restoring(output):
-            learner.load_state_dict(state)
-    elif init is not None:
-        learner.start_from(init)
-    output.mkdir(parents=True, exist_ok=True)
-    save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     try:
+        if config.resume:
+            state = load_training_state(output)
+            spent = float(state["seconds"])
+            with restoring(output):
+                learner.load_state_dict(state)
+        elif init is not None:
+            learner.start_from(init)
+        output.mkdir(parents=True, exist_ok=True)
+        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
         _run(config, output, learner, spent)
     finally:
         learner.env.close()

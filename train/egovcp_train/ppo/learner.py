@@ -30,7 +30,7 @@ from egovcp_train.ppo.config import PpoTrainConfig
 class ContactEnv(VecEnv):  # type: ignore[misc]
     """N robots, each of which begins the next episode as soon as one is over.
 
-    Episodes are numbered from ``first_episode``; the tasks alternate.
+    Episode n from ``first_episode`` on is the scenario n // T of task n % T, of T tasks.
     """
 
     def __init__(
@@ -85,11 +85,11 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the threads of the simulator."""
         self.env.close()
 
     def _scenarios(self, count: int) -> list[Scenario]:
-        """The next episodes; episodes are numbered per task from 0."""
+        """Scenarios of the next episodes."""
         found = []
         for number in range(self.episodes, self.episodes + count):
             task_episode, task = divmod(number, len(self._tasks))
