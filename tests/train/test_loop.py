@@ -96,8 +96,8 @@ def test_a_seed_repeats_the_updates_bit_for_bit() -> None:
 def test_the_state_restores_a_learner_bit_for_bit() -> None:
     straight, stopped, other = _with_critic(), _with_critic(), _with_critic(seed=9)
     for seed in range(2):
-        straight.update(random_batch(2, 3, seed), 0.0)
-        stopped.update(random_batch(2, 3, seed), 0.0)
+        straight.update(random_batch(2, 3, seed), 0.3)
+        stopped.update(random_batch(2, 3, seed), 0.3)
     other.load_state_dict(stopped.state_dict())
     for seed in range(2, 4):
         straight.update(random_batch(2, 3, seed), 0.5)
@@ -110,23 +110,36 @@ def test_the_state_restores_a_learner_bit_for_bit() -> None:
     assert _same(straight.critic.value.state_dict(), other.critic.value.state_dict())
 
 
-def test_the_critic_is_trained_too() -> None:
+def test_the_critic_is_trained_too_once_q_ranks_actions() -> None:
     learner = _with_critic()
     assert learner.critic is not None
-    before = {k: v.clone() for k, v in learner.critic.value.state_dict().items()}
-    assert learner.update(random_batch(2, 3), 0.0)["loss/critic"] > 0
+    before = copy.deepcopy(learner.critic.value.state_dict())
+    assert "loss/critic" not in learner.update(random_batch(2, 3), 0.09)
+    assert _same(before, learner.critic.value.state_dict())
+    assert learner.update(random_batch(2, 3), 0.1)["loss/critic"] > 0
     assert not _same(before, learner.critic.value.state_dict())
 
 
 def test_a_step_with_a_bad_reward_changes_neither_model_nor_critic() -> None:
     learner, batch = _with_critic(), random_batch(2, 3)
     assert learner.critic is not None
-    learner.update(batch, 0.0)
-    before, value = _weights(learner), copy.deepcopy(learner.critic.value.state_dict())
+    learner.update(batch, 0.5)
+    before, critic = _weights(learner), copy.deepcopy(learner.critic.state_dict())
     batch.reward[0, 0] = torch.nan
-    learner.update(batch, 0.0)
+    learner.update(batch, 0.5)
     assert _same(before, _weights(learner))
-    assert _same(value, learner.critic.value.state_dict())
+    after = learner.critic.state_dict()
+    assert after["updates"] == critic["updates"]
+    assert all(_same(after[name], critic[name]) for name in ("value", "target"))
+
+
+def test_a_critic_that_is_not_finite_is_not_saved() -> None:
+    learner = _with_critic()
+    assert learner.critic is not None
+    learner.require_finite()
+    learner.critic.parameters[0].data.fill_(torch.nan)
+    with pytest.raises(DataError, match="weights are not finite"):
+        learner.require_finite()
 
 
 # --- recorded steps -------------------------------------------------------------------------

@@ -217,7 +217,7 @@ def test_a_run_fits_it_once_and_trains_it_further(
 @pytest.mark.parametrize("q_target", ["mc", "td"])
 def test_other_targets_do_without(q_target: str, arguments: Arguments, tmp_path: Path) -> None:
     assert main(arguments(tmp_path / "run", steps=2, policy__loss__q_target=q_target)) == 0
-    assert "critic" not in load_training_state(tmp_path / "run")["learner"]
+    assert load_training_state(tmp_path / "run")["learner"]["critic"] is None
 
 
 def test_data_without_objects_falls_back_to_returns(
@@ -229,4 +229,4 @@ def test_data_without_objects_falls_back_to_returns(
     monkeypatch.setattr(privileged_value, "has_objects", lambda store: False)
     assert main(arguments(tmp_path / "run", steps=2)) == 0
     assert "the data has no positions of objects: Q is fitted to returns" in capsys.readouterr().out
-    assert "critic" not in load_training_state(tmp_path / "run")["learner"]
+    assert load_training_state(tmp_path / "run")["learner"]["critic"] is None

@@ -32,7 +32,7 @@ class PrivilegedValueConfig:
     lr: float = bounded(1e-3, above=0)
     """Learning rate at the start; it decays to 0."""
     training_lr: float = bounded(3e-4, above=0)
-    """Learning rate while the world model is trained."""
+    """Peak learning rate while the world model is trained; it follows that of the model."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ from egovcp_train.privileged_value import Critic
 
 _MOST_GRAPHS: Final = 64
 """One for each row or image that may be the first (`egovcp.model.StepNoise`): 8 of the default."""
+_CRITIC_START: Final = 0.1
+"""Part of a run in which the critic is not changed: Q, which chooses the next actions of its
+target, does not rank actions yet."""
 _MAX_SKIPPED: Final = 3  # steps in a row whose loss or gradient is not finite
 
 type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...], Carry]
@@ -90,8 +93,12 @@ class Learner:
         with data_parallel(self.group.share):
             noise = sample_step_noise(self.model, batch, self.generator)
             names, values, gradients, states = self._gradients(batch, noise)
-            if self.critic:
-                error = self.critic.compute_gradients(
+            critic = self.critic if progress >= _CRITIC_START else None
+            if critic:
+                critic.set_learning_rate(
+                    self.config.privileged_value.training_lr * lr / self.config.lr
+                )
+                error = critic.compute_gradients(
                     self.model, batch, states, noise.actions, self.generator, self.bf16
                 )
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
@@ -100,14 +107,14 @@ class Learner:
         terms = self.group.sum_gradients(self._parameters, terms)
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
         total = norm + terms["loss/total"]
-        if self.critic:
-            found = self.group.sum_gradients(self.critic.parameters, {"loss/critic": error})
+        if critic:
+            found = self.group.sum_gradients(critic.parameters, {"loss/critic": error})
             terms, total = terms | found, total + found["loss/critic"]
         if self._is_finite(total):
             self.optimizer.step()
             self._average()
-            if self.critic:
-                self.critic.step()
+            if critic:
+                critic.step()
             if self.target:
                 self.target.update(self.model, self.model.config.loss.td_decay)
         self.step += 1
@@ -135,6 +142,7 @@ class Learner:
     def require_finite(self) -> None:
         """Raise `DataError` if the weights are not finite."""
         values = [*self.model.parameters(), *self.averaged.parameters()]
+        values += self.critic.parameters if self.critic else []
         if not all(bool(x.isfinite().all()) for x in values):
             raise DataError(
                 f"the weights are not finite after step {self.step}, so they are not saved; the "
@@ -170,7 +178,7 @@ class Learner:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             **({"target": self.target.state_dict()} if self.target else {}),
-            **({"critic": self.critic.state_dict()} if self.critic else {}),
+            "critic": self.critic.state_dict() if self.critic else None,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -181,7 +189,7 @@ class Learner:
         self.generator.set_state(state["generator"])
         if self.target:
             self.target.load_state_dict(state["target"])
-        if "critic" in state:
+        if state["critic"]:
             self.critic = Critic.restore(state["critic"], self.model, self.planner)
 
 

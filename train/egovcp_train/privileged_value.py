@@ -48,8 +48,8 @@ _ROWS_AT_ONCE: Final = 1 << 16
 _SAMPLED: Final = 14  # next actions besides holding the last one and moving to the neutral pose
 _TARGET_DECAY: Final = 0.98
 #: Standard deviation of errors of the object's position and velocity in what the critic is trained
-#: on, in units of `WorldModel.object_std` (G1: 0.11, 0.03 and 0.02 m, along x, y and z): about what
-#: images leave open, so that planned actions do not depend on more.
+#: on, in units of `WorldModel.object_std` (G1: 0.11, 0.03 and 0.02 m along x, y and z, and 0.18,
+#: 0.06 and 0.12 m/s): planned actions then leave some margin. Images leave more open.
 _OBJECT_ERROR: Final = 0.12
 
 
