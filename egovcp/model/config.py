@@ -53,12 +53,12 @@ class LossConfig:
     value: float = bounded(20.0, least=0)
     """Weight of the value loss on filtered states, in standard deviations of the return."""
     q_target: QTarget = "privileged"
-    """Target of Q. privileged: a network that is fitted beforehand, sees the position of the task's
-    object and predicts the value of planned actions (mc if the data lacks the position); mc: Monte
-    Carlo return; td: r + gamma Q'(h', z', a') with the next action of the data, 0 instead of Q'
-    after a failure."""
+    """Target of Q. privileged: a critic that sees the position of the task's object and predicts
+    the value of planned actions (mc if the data lacks the position); mc: Monte Carlo return; td:
+    r + gamma Q'(h', z', a') with the next action of the data, 0 instead of Q' after a failure."""
     sampled_actions: int = bounded(7, least=0, most=1000)
-    """privileged: actions per row to which Q is fitted besides the recorded one."""
+    """privileged: actions per row to which Q is fitted besides the recorded one, and of which the
+    critic's target takes the best."""
     td_decay: float = bounded(0.98, least=0, below=1)
     """td: decay per step of the target network Q'; 0: no target network."""
     imagined_steps: int = bounded(1, least=0, most=_FARTHEST)

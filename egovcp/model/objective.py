@@ -41,7 +41,7 @@ class StepNoise(NamedTuple):
     image: int  # index of the first image that is decoded
     multistep: int  # first row from which `multistep_losses` imagines
     autoregressive: int  # the same for `autoregressive_losses`; 0 if unused
-    actions: Tensor  # (B, T, K, 7), sampled actions of the privileged value; K = 0 without it
+    actions: Tensor  # (B, T, K, 7), for q_target=privileged; else K = 0
 
 
 def sample_step_noise(

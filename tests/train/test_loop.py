@@ -26,12 +26,15 @@ def _learner(config: OptimizerConfig = CONFIG) -> Learner:
     return Learner(toy_model(), config, seed=0)
 
 
+def _critic(seed: int = 0) -> Critic:
+    torch.manual_seed(seed)
+    value = PrivilegedValue(random_batch(2, 3).privileged.shape[-1])
+    return Critic(value, PlannerConfig(), lr=1e-3)
+
+
 def _with_critic(seed: int = 0) -> Learner:
     learner = Learner(toy_model(seed=seed), CONFIG, seed=seed)
-    torch.manual_seed(seed)
-    learner.critic = Critic(
-        PrivilegedValue(random_batch(2, 3).privileged.shape[-1]), PlannerConfig(), lr=1e-3
-    )
+    learner.critic = _critic(seed)
     return learner
 
 
@@ -144,20 +147,22 @@ def test_a_critic_that_is_not_finite_is_not_saved() -> None:
 
 # --- recorded steps -------------------------------------------------------------------------
 @pytest.mark.parametrize("dynamics", ["joint", "autoregressive"])
-@pytest.mark.parametrize("q_target", ["mc", "td"])
+@pytest.mark.parametrize("q_target", ["mc", "td", "privileged"])
 def test_recorded_steps_learn_the_same_bit_for_bit(
-    dynamics: Literal["joint", "autoregressive"], q_target: Literal["mc", "td"]
+    dynamics: Literal["joint", "autoregressive"], q_target: Literal["mc", "td", "privileged"]
 ) -> None:
     loss = dataclasses.replace(PRESETS["debug"].loss, q_target=q_target, decode_every=2)
     config = dataclasses.replace(PRESETS["debug"], dynamics=dynamics, loss=loss)
     plain, recorded = (Learner(toy_model(config), CONFIG, seed=0) for _ in range(2))
+    if q_target == "privileged":
+        plain.critic, recorded.critic = _critic(), _critic()
     recorder = RecomputingCapture()
     recorded._gradients = GraphedFunction(
         recorded._compute_gradients, recorder, max_graphs=64, copies=False
     )
     for seed in range(12):
-        expected = plain.update(random_batch(2, 6, seed), 0.0)
-        found = recorded.update(random_batch(2, 6, seed), 0.0)
+        expected = plain.update(random_batch(2, 6, seed), 0.5)
+        found = recorded.update(random_batch(2, 6, seed), 0.5)
         assert found.keys() == expected.keys()
         assert all(found[name].equal(value) for name, value in expected.items())
     assert _same(_weights(plain), _weights(recorded))

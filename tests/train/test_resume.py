@@ -289,14 +289,14 @@ def test_resuming_with_what_does_not_fit_is_refused(
     assert _equal(_state(output), _state(finished))
 
 
-@pytest.mark.parametrize("name", ["datasets", "streams", "seconds"])
+@pytest.mark.parametrize("name", ["datasets", "streams", "seconds", "critic"])
 def test_a_checkpoint_of_another_version_is_refused(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
     folder = output / "checkpoints" / "last" / "training_state"
     state = load_training_state(output)
-    del state[name]
+    del (state if name in state else state["learner"])[name]
     torch.save(state, folder / checkpoint.STATE_FILE)
     (folder / checkpoint.DIGEST_FILE).unlink()
     _refused([f"--output_dir={output}", "--resume"], 4, capsys, name)

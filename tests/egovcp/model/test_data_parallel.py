@@ -1,9 +1,5 @@
 """A batch that two processes share gives the loss and the gradient of the whole."""
 
-import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 import torch
 from torch import Tensor
@@ -11,27 +7,9 @@ from torch import Tensor
 from egovcp.model import Batch, WorldModel, world_model_loss
 from egovcp.model.parallel import DataParallelRank, data_parallel, over_all_rows, row_noise
 from egovcp.testing import random_batch, toy_model
+from tests.support.data_parallel import in_two_processes
 
 ROWS = 2  # of each of two processes
-
-
-def _together[T](work: Callable[[DataParallelRank], T]) -> list[T]:
-    """Run both processes' work, each in a thread, with a sum over the two."""
-    barrier = threading.Barrier(2, timeout=60)
-    given: dict[int, Tensor] = {}
-
-    def run(rank: int) -> T:
-        def add_up(x: Tensor) -> Tensor:
-            given[rank] = x
-            barrier.wait()
-            total = given[0] + given[1]
-            barrier.wait()  # nobody overwrites what the other has yet to read
-            return total
-
-        return work(DataParallelRank(rank, 2, add_up))
-
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(run, range(2)))
 
 
 def _uneven() -> Batch:
@@ -67,7 +45,7 @@ def test_losses_and_gradients_add_up_to_those_of_the_whole_batch(preset: str) ->
             return _learned(models[share.rank], _part(batch, share.rank))
 
     models = [toy_model(preset), toy_model(preset)]
-    (terms_a, grad_a), (terms_b, grad_b) = _together(work)
+    (terms_a, grad_a), (terms_b, grad_b) = in_two_processes(work)
     terms, gradients = _learned(toy_model(preset), batch)
     for name, value in terms.items():
         torch.testing.assert_close(terms_a[name] + terms_b[name], value, rtol=1e-4, atol=1e-5)
@@ -90,7 +68,7 @@ def test_the_noise_is_that_of_the_whole_batch() -> None:
             noise = row_noise((ROWS, 5), generator, torch.device("cpu"))
         return noise, torch.rand(3, generator=generator)
 
-    (a, after_a), (b, after_b) = _together(draw)
+    (a, after_a), (b, after_b) = in_two_processes(draw)
     generator = torch.Generator().manual_seed(1)
     assert torch.equal(torch.cat([a, b]), torch.randn(2 * ROWS, 5, generator=generator))
     after = torch.rand(3, generator=generator)
