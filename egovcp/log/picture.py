@@ -255,8 +255,11 @@ def video_frames(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Frame
     width, height = SIZE
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    scene = figure.add_axes((0.0, 0.0, 0.66, 0.93), **AXES_OPTIONS)
-    titles = ("depth image", f"imagined {AHEAD / robot.planner_hz:.2f} s before")
+    titles = ["depth image", f"imagined {AHEAD / robot.planner_hz:.2f} s before"]
+    if not any(tick.depth.any() for tick in ticks):  # no camera
+        titles = []
+    left = 0.0 if titles else 0.17
+    scene = figure.add_axes((left, 0.0, 0.66, 0.93), **AXES_OPTIONS)
     images = [figure.add_axes((0.68, 0.52 - 0.5 * row, 0.3, 0.4)) for row in range(len(titles))]
     for axes, title in zip(images, titles, strict=True):
         axes.set_title(title, fontsize=8)
@@ -266,8 +269,9 @@ def video_frames(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Frame
         for artist in (*scene.collections, *(image for axes in images for image in axes.images)):
             artist.remove()
         draw_scene(scene, ticks[i], meshes, robot)
-        draw_depth(images[0], ticks[i].depth / 1000.0, robot)
-        draw_depth(images[1], imagined_of(ticks, i), robot)
+        shown = (ticks[i].depth / 1000.0, imagined_of(ticks, i))
+        for axes, depth in zip(images, shown, strict=False):
+            draw_depth(axes, depth, robot)
         clock.set_text(f"{ticks[i].index / robot.planner_hz:.2f} s")
         canvas.draw()  # type: ignore[no-untyped-call]
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]

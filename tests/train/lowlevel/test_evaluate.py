@@ -1,11 +1,13 @@
 """``egovcp-eval-lowlevel``: what is commanded, what is measured, what is written."""
 
+import dataclasses
 import json
 import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from egovcp.robot.controllers import make_controller
@@ -157,10 +159,10 @@ def test_an_interrupted_evaluation_keeps_the_skills_that_were_played(
 ):
     original = trial.play
 
-    def interrupted(controller, skill, *args):
+    def interrupted(controller, skill, *args, **options):
         if skill.name == "reach":
             signal.raise_signal(signal.SIGINT)
-        return original(controller, skill, *args)
+        return original(controller, skill, *args, **options)
 
     monkeypatch.setattr(trial, "play", interrupted)
     flags = [f"--output_dir={tmp_path}", "--skills=push,reach", "--episodes=2", "--threads=1"]
@@ -177,11 +179,11 @@ def test_an_interrupted_skill_counts_the_batches_that_were_played(
 ):
     original, seeds = trial.play, []
 
-    def interrupted(controller, skill, robots, seed, *args):
+    def interrupted(controller, skill, robots, seed, *args, **options):
         seeds.append(seed)
         if len(seeds) == 2:
             signal.raise_signal(signal.SIGINT)
-        return original(controller, skill, robots, seed, *args)
+        return original(controller, skill, robots, seed, *args, **options)
 
     monkeypatch.setattr(trial, "play", interrupted)
     monkeypatch.setattr(evaluate, "_BATCH", 2)
@@ -216,3 +218,19 @@ def test_bad_options_are_refused(tmp_path, capsys, flag, code, message):
     assert main([f"--output_dir={tmp_path / 'out'}", flag]) == code
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_videos_show_the_first_robot_of_each_skill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = dataclasses.replace(next(s for s in SKILLS if s.name == "turning"), seconds=0.4)
+    monkeypatch.setattr("egovcp_train.lowlevel.evaluate.SKILLS", (short,))
+    out = tmp_path / "out"
+    flags = [f"--output_dir={out}", "--skills=turning", "--episodes=2", "--videos=true"]
+    assert main(flags) == 0
+    with Image.open(out / "turning.gif") as image:
+        assert image.n_frames == 5
+        assert np.asarray(image.convert("L")).std() > 10
+    assert (out / "turning.rrd").stat().st_size > 10_000
+    assert main(flags) == 2
+    assert f"{out / 'turning.gif'} exists" in capsys.readouterr().err

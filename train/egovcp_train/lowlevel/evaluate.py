@@ -61,7 +61,7 @@ class LowLevelEvalConfig:
     """
 
     output_dir: str
-    """Folder for lowlevel.json; its other files are left alone."""
+    """Folder for lowlevel.json and videos; its other files are left alone."""
     controller: str = "walk"
     """walk (which the package ships), stance, or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
@@ -74,6 +74,9 @@ class LowLevelEvalConfig:
     """Noise of proprioception."""
     feet: Literal["stock", "points"] = "stock"
     """Foot collision model."""
+    videos: bool = False
+    """Also write NAME.gif and NAME.rrd of the first robot of each skill; needs matplotlib and
+    Rerun."""
     seed: int = bounded(1000, least=0)
     """Seed of robots, commands, pushes and noise."""
     threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
@@ -99,6 +102,8 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     """
     skills = _chosen(config.skills)
     require_packages("egovcp-train", PROG, *SIMULATOR_MODULES)
+    if config.videos:
+        require_packages("egovcp-train", "--videos", "matplotlib", "rerun")
     controller = make_controller(config.controller)
     output = Path(config.output_dir)
     require_writable(output)
@@ -137,6 +142,13 @@ def _play_all(
     Raises:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
+    recorders: dict[str, Any] = {}
+    if config.videos:
+        from egovcp_train.lowlevel.recording import SkillRecorder  # Rerun
+
+        folder = Path(config.output_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        recorders = {skill.name: SkillRecorder(skill.name, folder) for skill in skills}
     total = len(skills) * config.episodes
     with (
         stop_on_signal() as received,
@@ -146,7 +158,7 @@ def _play_all(
             bar.set_postfix_str(skill.name)
             parts: list[Any] = []
             try:
-                _play(config, skill, bar, parts, lambda: bool(received))
+                _play(config, skill, bar, parts, lambda: bool(received), recorders.get(skill.name))
             finally:
                 if parts:
                     figures[skill.name] = _figures(skill, parts, config.episodes)
@@ -166,6 +178,7 @@ def _play(
     bar: Any,
     parts: list[Any],
     stopped: Callable[[], bool],
+    recorder: Any,
 ) -> None:
     """Play a skill with batches of robots; appends the outcomes to ``parts``."""
     from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
@@ -184,8 +197,11 @@ def _play(
                 config.feet,
                 threads,
                 stopped,
+                on_tick=recorder.add if recorder and not first else None,
             )
         )
+        if recorder and not first:
+            recorder.write()
         bar.update(robots)
 
 

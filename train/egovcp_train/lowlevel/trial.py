@@ -104,8 +104,11 @@ def play(
     threads: int = 1,
     stopped: Callable[[], bool] = lambda: False,
     options: PhysicsOptions | None = None,
+    on_tick: Callable[[Snapshot, Array], None] | None = None,
 ) -> SkillOutcome:
     """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
+
+    ``on_tick`` gets the state of all robots and their commands (N, 10) after each tick.
 
     Raises:
         SimulationDiverged: the velocities of a robot that has not fallen are unphysical.
@@ -132,6 +135,8 @@ def play(
             _require_valid(physics, alive[tick], f"skill {skill.name}, seed {seed}, tick {tick}")
             alive[tick:] &= ~_fallen(x)
             series.add(x, command, controller.stepping)
+            if on_tick:
+                on_tick(x, command)
     return _measure(skill, commands, series, alive)
 
 
