@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from report import parser, publish
 
+from egovcp.eval_scores import Interval, bootstrap
 from egovcp.hardware import available_cores
-from egovcp.intervals import Interval, bootstrap
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.mjcf import FootModel
 from egovcp.sim.config import SensorConfig

@@ -23,7 +23,7 @@ from itertools import batched
 import numpy as np
 from report import parser, publish
 
-from egovcp.intervals import Interval
+from egovcp.eval_scores import Interval
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.env import VectorEnv

@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.eval_scores import EvalScores
-from egovcp.intervals import wilson
+from egovcp.eval_scores import EvalScores, wilson
 from egovcp.terminal import one_line
 
 #: Task -> controller -> episodes.

@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.eval_scores import Array, EvalScores
-from egovcp.intervals import signed_range
+from egovcp.eval_scores import Array, EvalScores, signed_range
 from egovcp_experiment.cell import Record
 from egovcp_experiment.report import (
     Plot,

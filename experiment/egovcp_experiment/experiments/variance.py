@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.eval_scores import EvalScores
-from egovcp.intervals import signed_range
+from egovcp.eval_scores import EvalScores, signed_range
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
-from egovcp.intervals import bootstrap, wilson
+from egovcp.eval_scores import bootstrap, wilson
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import PLANNER_HZ
 from egovcp_experiment.config import TASKS

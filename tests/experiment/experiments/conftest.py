@@ -9,5 +9,5 @@ import pytest
 def few_resamples() -> Iterator[None]:
     """A bootstrap interval for each cell, whose last digits are not tested here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("egovcp.intervals._RESAMPLES", 500)
+        patch.setattr("egovcp.eval_scores._RESAMPLES", 500)
         yield

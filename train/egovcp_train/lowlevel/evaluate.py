@@ -15,9 +15,9 @@ from tqdm import tqdm
 from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.eval_scores import wilson
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
-from egovcp.intervals import wilson
 from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
@@ -144,7 +144,7 @@ def _play_all(
     """
     recorders: dict[str, Any] = {}
     if config.videos:
-        from egovcp_train.lowlevel.recording import SkillRecorder  # Rerun
+        from egovcp_train.lowlevel.trial import SkillRecorder  # MuJoCo
 
         folder = Path(config.output_dir)
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Plays a skill with many robots at once and measures the outcome."""
+"""Plays a skill with many robots at once, measures the outcome, and records a robot."""
 
 from __future__ import annotations
 
@@ -6,21 +6,32 @@ from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import SimulationDiverged
+from egovcp.errors import SimulationDiverged, UsageError
+from egovcp.log.tick import BasePose, RunInfo, Tick
 from egovcp.robot.arms import nearest_reachable
 from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.g1 import WAIST
 from egovcp.robot.geometry import rotation_matrix, rotation_vector
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
+from egovcp.robot_spec import G1
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import MAX_SPEED, noise_std
-from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN
+from egovcp.spec import (
+    ACTION_BOX,
+    COMMAND_SLICE,
+    CONTROLLER_HZ,
+    CONTROLLER_TICKS_PER_PLAN,
+    PLANNER_HZ,
+    STATE_DIM,
+    STATE_SLICES,
+)
 from egovcp_train.lowlevel import sensing
 from egovcp_train.lowlevel.commands import horizontal
 from egovcp_train.lowlevel.config import DisturbanceConfig
@@ -242,3 +253,59 @@ def _lag(hands: Array, targets: Array, counted: NDArray[np.bool_]) -> Array:
     table = np.array(errors)
     best = np.argmin(np.where(np.isnan(table), np.inf, table), axis=0) / CONTROLLER_HZ
     return np.where(np.isnan(table).all(axis=0), np.nan, best)
+
+
+class SkillRecorder:
+    """Collects every second tick of a robot, and writes ``NAME.gif`` and ``NAME.rrd``.
+
+    There is no camera, so the depth images are empty.
+    """
+
+    def __init__(self, name: str, folder: Path) -> None:
+        """Choose the files.
+
+        Raises:
+            UsageError: one of them exists.
+        """
+        self._name, self._stem = name, folder / name
+        self._seen = 0
+        self._ticks: list[Tick] = []
+        for suffix in (".gif", ".rrd"):
+            if (path := self._stem.with_suffix(suffix)).exists():
+                raise UsageError(f"--videos: {path} exists; choose another --output_dir")
+
+    def add(self, x: Snapshot, command: Array) -> None:
+        """Add a tick of the controller: the state of all robots and their commands (N, 10)."""
+        self._seen += 1
+        if self._seen % CONTROLLER_TICKS_PER_PLAN != 1:
+            return
+        index = len(self._ticks)
+        state = np.zeros(STATE_DIM)
+        state[COMMAND_SLICE] = command[0]
+        state[STATE_SLICES["joint_position"]] = x.joints[0]
+        action = ACTION_BOX.to_normalised(command[0, 3:])
+        self._ticks.append(
+            Tick(
+                index,
+                index * 10**9 // PLANNER_HZ,
+                np.zeros(G1.depth, np.uint16),
+                state,
+                action_planned=action,
+                action_sent=action,
+                base=BasePose(x.position[0].copy(), x.quaternion[0].copy()),
+            )
+        )
+
+    def write(self) -> None:
+        """Write the files."""
+        from egovcp.log.picture import PictureSink
+        from egovcp.log.rerun import RerunSink
+
+        for sink in (
+            PictureSink(self._stem.with_suffix(".gif")),
+            RerunSink(self._stem.with_suffix(".rrd")),
+        ):
+            sink.open(RunInfo(self._name))
+            for tick in self._ticks:
+                sink.write(tick)
+            sink.close()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from egovcp.intervals import wilson
+from egovcp.eval_scores import wilson
 
 
 @pytest.mark.parametrize(
