@@ -171,7 +171,7 @@ class TrainConfig:
     """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
-    steps: int = bounded(10_000, least=1)
+    steps: int = bounded(6000, least=1)
     """Gradient steps."""
     max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit in minutes; the learning-rate schedule then follows elapsed time instead of

@@ -232,14 +232,14 @@ def _about(task: str) -> str:
 def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:
     from huggingface_hub import EvalResult, ModelCardData
 
-    datasets = [d for d in manifest.get("datasets", []) if d.get("repo_id")]
+    datasets = [d for d in manifest.get("datasets", []) if d.get("revision")]  # those on the Hub
     results = [
         EvalResult(
             task_type="robotics",
             dataset_type=datasets[0]["repo_id"],
             dataset_name=datasets[0]["repo_id"],
             dataset_split="held-out episodes",
-            dataset_revision=datasets[0].get("revision") or None,
+            dataset_revision=datasets[0]["revision"],
             metric_type=name,
             metric_value=value,
         )
