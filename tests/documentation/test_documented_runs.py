@@ -52,6 +52,7 @@ _ELSEWHERE = {
     "--task=bag": "tests/test_examples.py",
     "--task=arm_task": "tests/test_examples.py",
     "data/bag": "tests/test_examples.py",
+    "data/arm": "tests/test_examples.py",
 }
 #: Repository on the fake Hub -> folder.
 _PUBLISHED = {

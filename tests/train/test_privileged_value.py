@@ -1,5 +1,6 @@
 """The fit of the privileged value, and training with it."""
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -141,9 +142,11 @@ def test_two_processes_have_the_error_and_gradient_of_the_whole_batch() -> None:
     states = filter_sequence(model, batch, sample=False).carry
     sampled = sample_actions(batch.prev_action, 3, torch.Generator().manual_seed(0))
 
+    torch.manual_seed(0)
+    value = PrivilegedValue(batch.privileged.shape[-1])
+
     def work(share: DataParallelRank) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        torch.manual_seed(0)
-        critic = Critic(PrivilegedValue(batch.privileged.shape[-1]), _PLANNER, lr=1e-3)
+        critic = Critic(copy.deepcopy(value), _PLANNER, lr=1e-3)
         rows = slice(share.rank * 4 // share.ranks, (share.rank + 1) * 4 // share.ranks)
         with data_parallel(share):
             error = critic.compute_gradients(
