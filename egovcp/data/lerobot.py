@@ -42,6 +42,8 @@ class Feature:
     names: tuple[str, ...]
     """Of the values, if there is one for each."""
     is_depth: bool
+    info: Mapping[str, Any] = field(default_factory=dict)
+    """Of its camera: format of the video, unit of depth."""
 
     @property
     def is_camera(self) -> bool:
@@ -321,9 +323,8 @@ def _feature(key: str, found: Mapping[str, Any]) -> Feature:
     shape = tuple(int(n) for n in found["shape"])
     names = tuple(map(str, _flat_names(found.get("names"))))
     size = int(np.prod(shape))
-    return Feature(
-        key, str(found["dtype"]), shape, names if len(names) == size else (), bool(depth)
-    )
+    names = names if len(names) == size else ()
+    return Feature(key, str(found["dtype"]), shape, names, bool(depth), info)
 
 
 def _flat_names(names: object) -> list[object]:

@@ -3,17 +3,68 @@
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.data import tiff
+from egovcp.data.lerobot import EpisodeRow, Feature
 from egovcp.errors import DataError
+
+_LARGEST_CODE: Final = 4095  # of a depth video, 12 bits
+
+
+def camera_images(
+    row: EpisodeRow, camera: Feature, table: pa.Table, times: NDArray[np.float64]
+) -> Iterator[NDArray[Any]]:
+    """The images of a camera in an episode: (H, W, 3) uint8; depth (H, W), uint16 in mm or float32
+    in m.
+
+    Args:
+        row: the episode.
+        camera: its camera.
+        table: the rows of the episode, which hold the images unless they are in a video.
+        times: (T,) time of each row in the episode, s.
+
+    Raises:
+        DataError: with `frame` set, an image is damaged or missing.
+    """
+    if camera.dtype != "video":
+        for frame, content in enumerate(table[camera.key]):
+            yield np.asarray(decode_image(content.as_py(), frame, camera.key))
+        return
+    span, shown = row.videos[camera.key], 0
+    for frame in decode_frames(span.path, span.start_s + times):
+        shown += 1
+        if camera.is_depth:
+            yield _depth_of(frame.to_ndarray(format="gray16le") >> 4, camera.info)
+        else:
+            yield frame.to_ndarray(format="rgb24")
+    if shown < len(times):
+        raise tiff.frame_error(shown, f"{camera.key} ends after {shown} of {len(times)} frames")
+
+
+def _depth_of(codes: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.float32]:
+    """Depth, m, of the codes of a depth video; the inverse of LeRobot's `quantize_depth`."""
+    low, high = (float(info.get(f"video.{name}", value)) for name, value in _DEPTH_RANGE.items())
+    fraction = codes.astype(np.float64) / _LARGEST_CODE
+    if not info.get("video.use_log", True):
+        return (low + fraction * (high - low)).astype(np.float32)
+    shift = float(info.get("video.shift", _DEPTH_SHIFT))
+    first, last = math.log(low + shift), math.log(high + shift)
+    return (np.exp(first + fraction * (last - first)) - shift).astype(np.float32)
+
+
+#: LeRobot's defaults, m.
+_DEPTH_RANGE: Final[Mapping[str, float]] = {"depth_min": 0.01, "depth_max": 10.0}
+_DEPTH_SHIFT: Final = 3.5
 
 
 def decode_image(content: object, frame: int, key: str) -> Any:

@@ -53,6 +53,7 @@ _ELSEWHERE = {
     "--task=arm_task": "tests/test_examples.py",
     "data/bag": "tests/test_examples.py",
     "data/arm": "tests/test_examples.py",
+    "--features=": "tests/train/test_features.py",
 }
 #: Repository on the fake Hub -> folder.
 _PUBLISHED = {

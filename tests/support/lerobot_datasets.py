@@ -63,10 +63,20 @@ KINDS: Mapping[str, tuple[dict[str, Any], Sequence[int], Sequence[str], dict[str
 
 
 def write_dataset(root: Path, kind: str) -> Path:
-    """A dataset of one of `KINDS`, tasks in turn."""
+    """A dataset of one of `KINDS`."""
+    return write_features(root, *KINDS[kind])
+
+
+def write_features(
+    root: Path,
+    features: dict[str, Any],
+    lengths: Sequence[int],
+    tasks: Sequence[str],
+    options: Mapping[str, Any],
+) -> Path:
+    """A dataset with these features, tasks in turn; for the arguments see `KINDS`."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    features, lengths, tasks, options = KINDS[kind]
     sizes = {k: v for k, v in options.items() if k not in ("fps", "use_videos")}
     dataset = LeRobotDataset.create(
         "me/theirs", features=features, root=root, robot_type="so100",
@@ -89,7 +99,7 @@ def _value(
     shape, dtype = feature["shape"], feature["dtype"]
     if dtype == "string":
         return f"step {t}"
-    if feature is DEPTH:
+    if (feature.get("info") or {}).get("is_depth_map"):
         return rng.integers(300, 4000, shape, np.uint16)
     if dtype in ("video", "image"):
         return np.full(shape, 5 * t, np.uint8) + rng.integers(0, 20, shape, np.uint8)

@@ -73,9 +73,8 @@ class LoadingConfig:
     """How episodes are loaded during training."""
 
     mode: Literal["auto", "ram", "stream"] = "auto"
-    """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window, or
-    from the Hub, file by file as they are needed, where there is no local copy; auto: ram if that
-    takes at most half of the free memory."""
+    """ram: all in memory, 6.3 kB per frame; stream: read through a shuffle window from the disk, or
+    file by file from the Hub; auto: ram if half of the free memory is enough."""
     shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
     """Shuffle window of mode stream."""
     sample_files: int = bounded(16, least=1, most=65_536)
@@ -155,6 +154,9 @@ class TrainConfig:
     datasets: tuple[WeightedDatasetConfig, ...] = ()
     """Train on several datasets (replaces --dataset), '[{root: data/ball, weight: 2}, {repo_id:
     me/wall, weight: 1}]'; without weights, frames are sampled uniformly over all of them."""
+    features: dict[str, str] = field(default_factory=dict)
+    """Names of image, state, action, reward and success in another LeRobot dataset, '{image:
+    NAME}'; it is converted to OUTPUT_DIR/dataset first."""
     preset: str = "default"
     """Starting point of all options: default; laptop (ends after 9.5 minutes); paper (the paper's
     losses, returns and planner); debug (tiny networks); or an ablation of the default, such as
@@ -198,7 +200,7 @@ class TrainConfig:
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"
     """Precision of matrix products: no, bf16, or auto (as set by accelerate launch, otherwise
-    bf16 if the device supports it: Ampere or newer GPUs, CPUs with AVX512-BF16 or AMX)."""
+    bf16 if the hardware supports it)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)

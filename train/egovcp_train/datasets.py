@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -28,9 +29,11 @@ from egovcp.data import (
     estimate_training_stats,
     sample_files,
 )
+from egovcp.data.convert import convert_dataset
+from egovcp.data.lerobot import is_own
 from egovcp.data.samplers import PrefetchIterator
 from egovcp.data.schema import INFO_PATH
-from egovcp.data.source import is_local, local_root
+from egovcp.data.source import is_local, local_root, locate
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
@@ -114,6 +117,31 @@ def _prepare(
     return TrainingData(readers, config, *build(readers, config, sampling, mix, model, group))
 
 
+def converted(config: TrainConfig, group: ProcessGroup) -> TrainConfig:
+    """The options with OUTPUT_DIR/dataset as the dataset, into which the first process has
+    converted the one that has other features; unchanged without ``features``.
+
+    Raises:
+        UsageError: --datasets is given too, or the dataset has no such features.
+        DataError: it is missing or damaged.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    if not config.features:
+        return config
+    if config.datasets or config.resume:
+        raise UsageError(
+            "--features is for the --dataset of a new run; leave it out with --datasets, which "
+            "takes converted ones, and with --resume"
+        )
+    root = Path(config.output_dir).absolute() / "dataset"
+    if group.is_first:
+        source = locate(config.dataset, config.loading.network)
+        convert_dataset(source, config.features, root, config.dataset.episodes)
+    group.broadcast(None)
+    dataset = SelectedDatasetConfig(repo_id=config.dataset.repo_id, root=str(root))
+    return dataclasses.replace(config, dataset=dataset, features={})
+
+
 def open_in_turn(config: TrainConfig, group: ProcessGroup) -> tuple[DatasetReader, ...]:
     """As `open_readers`; the first process downloads before the others start."""
     readers = open_readers(config) if group.is_first else ()
@@ -137,9 +165,18 @@ def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
 
 
 def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
-    if config.loading.mode == "ram":
-        return DatasetReader.open(dataset)
-    return DatasetReader.on_demand(dataset, config.loading.network)
+    try:
+        if config.loading.mode == "ram":
+            return DatasetReader.open(dataset)
+        return DatasetReader.on_demand(dataset, config.loading.network)
+    except DataError as error:
+        info = Path(error.file)
+        if info.name != Path(INFO_PATH).name or is_own(info.parents[1]):
+            raise
+        raise DataError(
+            f"{info.parents[1]} does not have egovcp's features ({error.problem}); give the names "
+            "of its own as --features='{image: NAME}', see --help"
+        ) from error
 
 
 def pinned(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:

@@ -44,6 +44,7 @@ from egovcp_train.datasets import (
     EVALUATION_EPISODES,
     FRAME_BYTES,
     TrainingData,
+    converted,
     open_in_turn,
     prepare,
     require_datasets,
@@ -100,6 +101,7 @@ def train(config: TrainConfig) -> None:
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
+    config = converted(config, group)
     readers = open_in_turn(config, group)
     robot = readers[0].robot
     model = WorldModel(config.policy.world_model(robot), robot)

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
-from egovcp.data.pictures import decode_frames, decode_image
-from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.data.pictures import camera_images
+from egovcp.errors import EnvironmentFailure
 from egovcp.files import removed_on_error
 from egovcp.packages import require_packages
 
@@ -38,7 +37,7 @@ def record_features(reader: LeRobotReader, row: EpisodeRow, output: Path) -> lis
         stream.save(output)
         for key, feature in features.items():
             if feature.is_camera:
-                _log_camera(stream, feature, _images(row, feature, table, times), times)
+                _log_camera(stream, feature, camera_images(row, feature, table, times), times)
             else:
                 _log_values(stream, feature, values_of(table[key], feature), times)
         stream.flush(timeout_sec=60.0)
@@ -63,31 +62,19 @@ def _log_values(
     stream.send_columns(path, _columns(times), scalars)
 
 
-def _images(
-    row: EpisodeRow, feature: Feature, table: pa.Table, times: NDArray[np.float64]
-) -> Iterator[NDArray[Any]]:
-    """The images of a camera, (H, W) or (H, W, 3)."""
-    if feature.dtype == "video":
-        span = row.videos[feature.key]
-        layout = "gray16le" if feature.is_depth else "rgb24"
-        for frame in decode_frames(span.path, span.start_s + times):
-            yield frame.to_ndarray(format=layout)
-        return
-    for number, content in enumerate(table[feature.key]):
-        yield np.asarray(decode_image(content.as_py(), number, feature.key))
-
-
 def _log_camera(
     stream: rr.RecordingStream,
     feature: Feature,
     images: Iterator[NDArray[Any]],
     times: NDArray[np.float64],
 ) -> None:
-    number = -1
     for number, image in enumerate(images):
         stream.set_time("frame", sequence=number)
         stream.set_time("time", duration=float(times[number]))
-        shown = rr.DepthImage(image) if feature.is_depth else rr.Image(image).compress(90)
+        per_metre = 1.0 if image.dtype == np.float32 else 1000.0
+        shown = (
+            rr.DepthImage(image, meter=per_metre)
+            if feature.is_depth
+            else rr.Image(image).compress(90)
+        )
         stream.log(feature.key.replace(".", "/"), shown)
-    if number + 1 < len(times):
-        raise DataError(f"{feature.key} ends after {number + 1} of {len(times)} frames")

@@ -1,0 +1,74 @@
+"""egovcp-train on a LeRobot dataset of another robot, with features of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from egovcp.artifact import load_artifact
+from egovcp.data import open_dataset
+from egovcp_train.train import main
+from tests.support.lerobot_datasets import ACTION, DEPTH, ONE, STATE, write_features
+
+type Arguments = Callable[..., list[str]]
+
+FEATURES = {
+    "observation.images.wrist": {**DEPTH, "shape": (48, 64, 1)},
+    "observation.state": STATE,
+    "action": ACTION,
+    "reward": {"dtype": "float32", **ONE},
+}
+NAMES = "--features={reward: reward}"
+
+
+@pytest.fixture(scope="module")
+def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("theirs") / "dataset"
+    options = {"fps": 20, "use_videos": False}
+    return write_features(root, FEATURES, [12] * 6, ("push the cube",), options)
+
+
+def test_trains_and_resumes(theirs: Path, arguments: Arguments, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert main(arguments(run, NAMES, dataset__root=theirs)) == 0
+    artifact = load_artifact(run / "checkpoints/last/pretrained_model")
+    robot = artifact.robot
+    assert (robot.robot_type, robot.planner_hz, robot.depth) == ("so100", 20, (48, 64))
+    assert (robot.state_dim, robot.action_names) == (3, ("pan", "grip"))
+    assert main([f"--output_dir={run}", "--resume", "--steps=8"]) == 0
+    # The converted dataset is one like any other.
+    assert len(open_dataset(run / "dataset")) == 6
+    again = arguments(tmp_path / "again", dataset__root=run / "dataset")
+    assert main(again) == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "problem"),
+    [
+        ((), "leave out --features"),
+        (("--datasets=[{root: x}]",), "--features is for the --dataset of a new run"),
+        (("--features={reward: rewrad}",), "did you mean 'reward'?"),
+    ],
+)
+def test_refusals(
+    flags: tuple[str, ...],
+    problem: str,
+    theirs: Path,
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    root = {} if not flags else {"dataset__root": theirs}
+    run = tmp_path / "run"
+    assert main(arguments(run, NAMES, **root) + list(flags)) == 2
+    assert problem in capsys.readouterr().err
+    assert not run.exists()
+
+
+def test_a_dataset_with_other_features_names_the_option(
+    theirs: Path, arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments(tmp_path / "run", dataset__root=theirs)) == 3
+    assert "--features" in capsys.readouterr().err
