@@ -174,8 +174,8 @@ def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
         if info.name != Path(INFO_PATH).name or is_own(info.parents[1]):
             raise
         raise DataError(
-            f"{info.parents[1]} does not have egovcp's features ({error.problem}); give the names "
-            "of its own as --features='{image: NAME}', see --help"
+            f"{info.parents[1]} does not have egovcp's features ({error.problem}); name the right "
+            "ones with --features='{image: NAME}', see --help"
         ) from error
 
 

@@ -1,5 +1,5 @@
-"""Scenes that no model was trained on: other objects, sizes, noise and delay, and several tasks in
-one episode (figure 4a)."""
+"""Scenes and physics that the model of all tasks was not trained on: other objects, sizes, noise,
+delay, feet, payload and gains, and several tasks in one episode (figure 4a)."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from egovcp_experiment.grid import ALL, Grid, Variant
 from egovcp_experiment.report import ExperimentReport, Part, Table, percent
 
 SUMMARY: Final = (
-    "unseen boxes, sizes, speeds, walls and arches; noise and delay; several tasks in one episode "
-    "(fig. 4a)"
+    "unseen boxes, sizes, speeds, walls and arches; noise, delay and physics; several tasks in one "
+    "episode (fig. 4a)"
 )
 #: The first condition of a task, which the others are compared with.
 TRAINED: Final = "as_trained"
 _REFERENCES: Final = ("hold", "oracle")
 
 #: Conditions of every task. Training has noise of 0.001 to 0.004 z^2, up to 1 % holes, actions
-#: delayed by 0 to 2 ticks of 20 ms, and images 20 to 80 ms old.
+#: delayed by 0 to 2 ticks of 20 ms, images 20 to 80 ms old, and a camera that looks up by 10 to 15
+#: degrees.
 _SENSING: Final[dict[str, Flags]] = {
     "noise_x4": {"env.camera.noise_per_z2": [0.008, 0.016]},
     "holes_10": {"env.camera.hole_probability": [0.1, 0.1]},
@@ -37,12 +38,28 @@ _SENSING: Final[dict[str, Flags]] = {
     "delay_0": {"env.delay.action_ticks": [0, 0], "env.delay.image_age": [0.02, 0.02]},
     "delay_action_80ms": {"env.delay.action_ticks": [4, 4]},
     "delay_image_120ms": {"env.delay.image_age": [0.12, 0.12]},
+    "pitch_20_up": {"env.camera.pitch_range": [-0.349, -0.349]},
+    "pitch_5_up": {"env.camera.pitch_range": [-0.087, -0.087]},
+}
+#: Physics for every task. Training has feet of four points each, a payload of -0.5 to 1.5 kg, and
+#: gains within 5 % (stiffness) and 10 % (damping).
+_PHYSICS: Final[dict[str, Flags]] = {
+    "stock_feet": {"env.feet": "stock"},
+    "payload_3kg": {"env.randomise.payload": [3, 3]},
+    "gains_80": {
+        "env.randomise.stiffness_scale": [0.8, 0.8],
+        "env.randomise.damping_scale": [0.8, 0.8],
+    },
+    "gains_120": {
+        "env.randomise.stiffness_scale": [1.2, 1.2],
+        "env.randomise.damping_scale": [1.2, 1.2],
+    },
 }
 _OWN: Final[dict[str, dict[str, Flags]]] = {
     "ball": {
         "box": {"env.ball.shape": "box"},
-        "small": {"env.ball.radius_range": [0.05, 0.08]},
-        "large": {"env.ball.radius_range": [0.14, 0.18]},
+        "radius_6cm": {"env.ball.radius_range": [0.06, 0.06]},
+        "radius_15cm": {"env.ball.radius_range": [0.15, 0.15]},
         "fast": {"env.ball.flight_range": [0.5, 0.6]},
         "slow": {"env.ball.flight_range": [1.0, 1.2]},
         "from_aside": {"env.ball.bearing_range": [0.35, 0.5]},
@@ -93,7 +110,7 @@ def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
     if task == "wall":
         low, high = WallConfig().push_speed_range
         own["harder"] = {"env.wall.push_speed_range": [high, high + (high - low) / 2]}
-    return {**own, **_SENSING}
+    return {**own, **_SENSING, **_PHYSICS}
 
 
 def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
@@ -114,11 +131,7 @@ def _plays(grid: Grid) -> dict[str, dict[str, tuple[list[str], str]]]:
     return {
         task: {
             name: (
-                grid.plays(
-                    task,
-                    Variant(f"in_{name}", play=flags),
-                    ALL if task == SequenceTask.name else task,
-                ),
+                grid.plays(task, Variant(f"in_{name}", play=flags), ALL),
                 grid.references(task, f"references-{task}-{name}", flags, _REFERENCES).name,
             )
             for name, flags in row.items()
@@ -145,8 +158,8 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
     if SequenceTask.name in plays:
         parts.append(
             "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
-            "played by the model of all tasks, whose input names neither tasks nor times. Each "
-            "part draws what its task draws alone; parts after a fall are failures."
+            "played by the same model, whose input names neither tasks nor times. Each part draws "
+            "what its task draws alone; parts after a fall are failures."
         )
     figures: dict[str, Any] = {}
     for task, row in plays.items():

@@ -138,7 +138,8 @@ def test_only_chosen_conditions_and_their_reference_are_played() -> None:
     plays = [c for c in generalised(only=("arch_then_box",)) if c.command is PLAY]
     assert {c.flags["task"] for c in plays} == {"sequence"}
     assert len(plays) == 4
-    assert {c.flags["task"] for c in generalised(only=("small",)) if c.command is PLAY} == {"ball"}
+    cells = generalised(only=("radius_6cm",))
+    assert {c.flags["task"] for c in cells if c.command is PLAY} == {"ball"}
 
 
 def test_the_report_has_the_parts_of_a_sequence() -> None:
