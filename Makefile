@@ -42,7 +42,7 @@ demo: install
 ship: install
 	@test -f "$(FROM)/manifest.json" || { echo "ship: error: FROM=$(FROM): expected the folder of a policy" >&2; exit 2; }
 	rm -rf egovcp/pretrained/contact
-	egovcp-export --format=float16 --policy.path="$(FROM)" --output_dir=egovcp/pretrained/contact
+	egovcp-export --policy.path="$(FROM)" --output_dir=egovcp/pretrained/contact
 
 POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.suppor
 
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy, PolicyStep
-from egovcp.rate import FixedRate, LockstepClock, MonotonicClock
+from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import ACTION_DIM, CONTROLLER_HZ, PLANNER_HZ, STATE_DIM, STATE_SLICES
 from egovcp_deploy.config import DeployConfig
@@ -43,6 +43,7 @@ from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
+from tests.support.lockstep import LockstepClock
 from tests.support.robots.fake_g1 import raised_priority
 
 _CONTROLLER = "stance"
@@ -85,9 +86,9 @@ class _Unwatched(MotorWatch):
         return MotorVerdict()
 
 
-def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLoop:
+def _loop(hardware: Hardware, checked: bool) -> ControlLoop:
     body = hardware.body
-    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned()), clock), state=State.ARMED)
+    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned())), state=State.ARMED)
     controller = make_controller(_CONTROLLER)
     if not checked:
         loop = ControlLoop(body, hardware.camera, controller, pilot)
@@ -98,9 +99,9 @@ def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLo
         hardware.camera,
         controller,
         pilot,
-        refusal=lambda: body.trouble,
+        refusal=lambda: body.refusal,
         fault=lambda: body.fault,
-        skipped=lambda: body.skipped,
+        skipped=lambda: body.rejected,
         link=hardware.link,
     )
 
@@ -119,12 +120,11 @@ def control_figures(rounds: int) -> dict[str, object]:
             )
         granted = raise_priority(CONTROL)
         try:
-            clock = MonotonicClock()
             for turn in range(2 * rounds):
                 checked = turn % 2 == 0
                 name = "checked" if checked else "unchecked"
                 hardware.body._filter = PlausibilityFilter() if checked else _Unchecked()
-                _measure(_loop(hardware, clock, checked), late[name], interval[name])
+                _measure(_loop(hardware, checked), late[name], interval[name])
         finally:
             hardware.close()
     figures: dict[str, object] = {"control_real_time_priority": granted}
@@ -156,7 +156,7 @@ def filter_figures(rounds: int) -> dict[str, object]:
     torch.set_num_threads(1)
     policy = Policy(WorldModel(WorldModelConfig()), PlannerConfig(), 1)
     clock = LockstepClock()
-    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned()), clock), state=State.ARMED)
+    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned())), state=State.ARMED)
     rng = np.random.default_rng(0)
     observe, judge = list[float](), list[float]()
     for _ in range(rounds * PLANNER_HZ):

@@ -33,8 +33,7 @@ import torch
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
-from egovcp.log.sink import Fanout, Sink
-from egovcp.log.tick import BasePose, Candidates, RunInfo, Tick
+from egovcp.log.tick import Candidates, Fanout, RunInfo, Sink, Tick
 from egovcp.log.viewer import LOOPBACK, LiveRerun, Viewer
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
@@ -171,7 +170,7 @@ def _tick() -> Tick:
         termination=0.01,
         reward_terms={"block": 0.0, "hit": 0.0, "fall": 0.0, "pose": -0.005},
         timing_ms={"observe": 1.0, "plan": 20.0, "decode": 5.0, "robot": 3.0},
-        base=BasePose(np.array([0.0, 0.0, 0.74]), np.array([1.0, 0.0, 0.0, 0.0])),
+        base=np.array([0.0, 0.0, 0.74, 1.0, 0.0, 0.0, 0.0]),
     )
 
 

@@ -127,6 +127,18 @@ def check_bounds(config: Any, prefix: str = "") -> None:
                     check_bounds(inner, f"{name}[{index}].")
 
 
+def check_ranges(where: str, config: object) -> None:
+    """Raise `UsageError` for a (low, high) pair in ``config`` with low > high; a field may also be
+    a pair of pairs. The message names the option ``where.FIELD``."""
+    for name, value in vars(config).items():
+        for pair in (value, *value) if isinstance(value, tuple) else ():
+            match pair:
+                case (int() | float() as low, int() | float() as high) if low > high:
+                    raise UsageError(
+                        f"expected low <= high, found {low} > {high} in {where}.{name}"
+                    )
+
+
 def check_cores(config: Any, prefix: str = "") -> None:
     """Raise `OutOfBounds` for more threads or processes than this machine's cores allow.
 

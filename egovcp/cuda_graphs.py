@@ -8,6 +8,7 @@ be captured is called directly.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import torch
@@ -22,34 +23,26 @@ type Capture = Callable[[Callable[[], Any], torch.device], tuple[Replay, Any]]
 """(function without arguments, device) -> (replay, results that the replay overwrites)."""
 
 
-class GraphCapture:
-    """Captures CUDA graphs that share their memory: only one may be replayed at a time."""
+def capture_graph(
+    pools: dict[torch.device, Any], function: Callable[[], Any], device: torch.device
+) -> tuple[Replay, Any]:
+    """A `Capture` whose graphs share the memory of ``pools``: one may be replayed at a time.
 
-    def __init__(self) -> None:
-        self._pools: dict[torch.device, Any] = {}
-
-    def __call__(self, function: Callable[[], Any], device: torch.device) -> tuple[Replay, Any]:
-        """See `Capture`.
-
-        Raises:
-            RuntimeError: the function has an operation that cannot be captured.
-        """
-        with torch.cuda.device(device):  # a capture on another device's stream is empty
-            if device not in self._pools:
-                self._pools[device] = torch.cuda.graph_pool_handle()
-            return _capture(function, self._pools[device])
-
-
-def _capture(function: Callable[[], Any], pool: Any) -> tuple[Replay, Any]:
-    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(WARM_UP_CALLS):
-            function()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):  # other threads may work
-        results = function()
+    Raises:
+        RuntimeError: the function has an operation that cannot be captured.
+    """
+    with torch.cuda.device(device):  # a capture on another device's stream is empty
+        pool = pools.setdefault(device, torch.cuda.graph_pool_handle())
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP_CALLS):
+                function()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        # other threads may work
+        with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):
+            results = function()
     return graph.replay, results
 
 
@@ -65,7 +58,7 @@ class GraphedFunction:
     Args:
         function: takes and returns tensors, None, or tuples of them; without synchronisation,
             random numbers and side effects. Arguments other than tensors are part of the shape.
-        capture: makes a graph, or raises `RuntimeError`; None: a `GraphCapture`.
+        capture: makes a graph, or raises `RuntimeError`; None: `capture_graph`.
         max_graphs: further shapes are computed without a graph.
         copies: return copies of the results, which later calls do not overwrite.
     """
@@ -77,7 +70,7 @@ class GraphedFunction:
         max_graphs: int = MAX_GRAPHS,
         copies: bool = True,
     ) -> None:
-        self._function, self._capture = function, capture or GraphCapture()
+        self._function, self._capture = function, capture or partial(capture_graph, {})
         self._max_graphs, self._copies = max_graphs, copies
         self._graphs: dict[object, _Graph | None] = {}
         self.error = ""

@@ -203,9 +203,6 @@ def output_features(robot: RobotSpec = G1) -> dict[str, Any]:
     return {spec.ACTION_KEY: {"type": "ACTION", "shape": [robot.action_dim]}}
 
 
-INPUT_FEATURES: Final = input_features()
-OUTPUT_FEATURES: Final = output_features()
-
 _IDENTITY = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
 
 

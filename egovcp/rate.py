@@ -1,13 +1,9 @@
-"""A fixed-rate loop on an injectable clock, with counters of overruns.
-
-Hardware and the real-time simulator use `MonotonicClock`, lock-step simulation and tests use
-`LockstepClock`, whose time does not depend on the speed of the machine.
-"""
+"""A fixed-rate loop on an injectable clock."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
@@ -38,38 +34,6 @@ class MonotonicClock:
 
 
 @dataclass
-class LockstepClock:
-    """Simulated time that changes only by `sleep_until` and `advance`."""
-
-    time_ns: int = 0
-
-    def now_ns(self) -> int:
-        """Nanoseconds of simulated time."""
-        return self.time_ns
-
-    def sleep_until(self, deadline_ns: int) -> None:
-        """Jump to ``deadline_ns`` unless it has passed."""
-        self.time_ns = max(self.time_ns, deadline_ns)
-
-    def advance(self, duration_ns: int) -> None:
-        self.time_ns += duration_ns
-
-
-@dataclass
-class RateCounters:
-    """Counters of a fixed-rate loop."""
-
-    ticks: int = 0
-    """Ticks completed."""
-    overruns: int = 0
-    """Ticks whose work ended after their period."""
-    skipped: int = 0
-    """Periods without a tick because of an overrun."""
-    worst_lateness_ns: int = 0
-    """Longest overrun, ns."""
-
-
-@dataclass
 class FixedRate:
     """Runs a loop at ``hz`` on a grid of deadlines that does not drift.
 
@@ -86,7 +50,6 @@ class FixedRate:
 
     hz: float
     clock: Clock
-    counters: RateCounters = field(default_factory=RateCounters)
     _next_ns: int = 0
 
     @property
@@ -94,28 +57,17 @@ class FixedRate:
         return round(NS_PER_S / self.hz)
 
     def start(self) -> None:
-        """Start the first period now; counters keep their values."""
+        """Start the first period now."""
         self._next_ns = self.clock.now_ns() + self.period_ns
-
-    def remaining_ns(self) -> int:
-        """Time left in the current period; negative after an overrun."""
-        return self._next_ns - self.clock.now_ns()
 
     def wait(self) -> int:
         """Sleep until the end of the period; returns the overrun, ns."""
-        late = max(0, -self.remaining_ns())
-        self._count(late)
+        late = max(0, self.clock.now_ns() - self._next_ns)
         missed = -(-late // self.period_ns)  # whole periods, rounded up
         self._next_ns += missed * self.period_ns
         self.clock.sleep_until(self._next_ns)
         self._next_ns += self.period_ns
         return late
-
-    def _count(self, late: int) -> None:
-        self.counters.ticks += 1
-        self.counters.overruns += late > 0
-        self.counters.skipped += -(-late // self.period_ns)
-        self.counters.worst_lateness_ns = max(self.counters.worst_lateness_ns, late)
 
 
 class RateLimiter:

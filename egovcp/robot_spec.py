@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.decode import DecodeError, require_type
+from egovcp.decode import DecodeError, decode
 from egovcp.errors import UsageError
 
 PATCH: Final = 16
@@ -184,43 +184,10 @@ class RobotSpec:
         """
         if content == G1.to_json():
             return G1
-        require_type(content, dict[str, Any], ROBOT_KEY)
-        assert isinstance(content, dict)
-        missing = sorted(_TYPES.keys() - content.keys())
-        if missing or content.get("spec_version") != spec.SPEC_VERSION:
-            problem = f"lacks {', '.join(missing)}" if missing else "is of another spec_version"
-            raise DecodeError(f"the description of the robot {problem}")
-        for name, kind in _TYPES.items():
-            require_type(content[name], kind, f"{ROBOT_KEY}.{name}")
-        try:
-            box = spec.ActionBox(*(tuple(content["action_box"][k]) for k in _BOX))
-            mirror = content["mirror"]
-            return RobotSpec(
-                robot_type=content["robot_type"],
-                depth=(content["depth"][0], content["depth"][1]),
-                depth_max_m=float(content["depth_max_m"]),
-                planner_hz=content["planner_hz"],
-                state_names=tuple(content["state_names"]),
-                action_names=tuple(content["action_names"]),
-                action_box=box,
-                mirror=None if mirror is None else Mirror(*(tuple(mirror[k]) for k in _MIRROR)),
-            )
-        except (UsageError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise DecodeError(f"{ROBOT_KEY}: {error}") from error
-
-
-_BOX: Final = tuple(f.name for f in dataclasses.fields(spec.ActionBox))
-_MIRROR: Final = tuple(f.name for f in dataclasses.fields(Mirror))
-_TYPES: Final[Mapping[str, Any]] = {
-    "robot_type": str,
-    "depth": tuple[int, int],
-    "depth_max_m": float,
-    "planner_hz": int,
-    "state_names": list[str],
-    "action_names": list[str],
-    "action_box": dict[str, list[float]],
-    "mirror": dict[str, list[float]] | None,
-}
+        options = decode(dict[str, Any], content, ROBOT_KEY)
+        if options.pop("spec_version", None) != spec.SPEC_VERSION:
+            raise DecodeError("the description of the robot is of another spec_version")
+        return decode(RobotSpec, options, ROBOT_KEY)
 
 
 def _box_problems(box: spec.ActionBox, size: int) -> list[str]:

@@ -16,7 +16,7 @@ x forward, y left, z up, rotated by yaw only).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +166,23 @@ ACTION_TERMS: Final = ("pose", "action_rate")
 POSE_COST: Final = 0.02  # per planner tick, times the mean squared action; 0 in the neutral pose
 #: Per planner tick, times the mean squared change of the action over `ACTION_RATE_LIMIT`.
 ACTION_RATE_COST: Final = 0.05
+
+
+# --- scene -----------------------------------------------------------------------
+@dataclass(frozen=True)
+class Solid:
+    """An object in the simulated scene, for logs."""
+
+    name: str
+    """Unique within the scene, such as ``wall``."""
+    shape: Literal["sphere", "box"]
+    size: tuple[float, float, float]
+    """Half extents along its own axes, m; for a sphere three times the radius."""
+    position_w: _Array
+    """(3,) centre, m."""
+    quaternion_w: _Array
+    """(4,) rotation to the world frame, wxyz."""
+
 
 # --- LeRobot feature names ---------------------------------------------------------
 DEPTH_KEY: Final = "observation.images.ego_depth"

@@ -277,6 +277,19 @@ def _options_of(config_class: Any, value: Any, name: str) -> str:
     return f"; its options are {listed}{', ...' if len(names) > _SHOWN_OPTIONS else ''}"
 
 
+def differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """Dotted name, and both values, of each leaf in which nested options differ; a missing one is
+    None."""
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            yield f"{prefix}{name}", (old, new)
+
+
 def default_of(field: dataclasses.Field[Any]) -> Any:
     """The default of a field; `MISSING`: the option is required."""
     if field.default_factory is not dataclasses.MISSING:

@@ -1,17 +1,13 @@
-"""Worker processes: what they inherit, graceful stops, and the Ray cluster."""
+"""Worker processes: what they inherit, and graceful stops."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import signal
 import time
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
-
-from egovcp.errors import EnvironmentFailure
-from egovcp.packages import require_packages
+from typing import Final
 
 _THREAD_LIMITS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -67,27 +63,3 @@ def stop_on_signal(
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def connect(distribution: str) -> Any:
-    """Connect to the cluster of ``RAY_ADDRESS``, or start a local one; returns the package `ray`.
-
-    Args:
-        distribution: the distribution whose extra `ray` installs Ray.
-
-    Raises:
-        EnvironmentFailure: Ray is not installed, or the cluster cannot be reached.
-    """
-    require_packages(distribution, "--backend=ray", "ray")
-    ray: Any = importlib.import_module("ray")
-    address = os.environ.get("RAY_ADDRESS")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    own = {} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-    try:
-        ray.init(address, log_to_driver=False, logging_level="warning", **own)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise EnvironmentFailure(
-            f"cannot reach the Ray cluster at {address or 'this machine'}: {error}; check "
-            "RAY_ADDRESS"
-        ) from error
-    return ray

@@ -155,17 +155,6 @@ def test_more_threads_or_processes_than_cores_can_share_are_refused(
     check_cores(_replaced(_default(command), path, 24))
 
 
-def test_a_cluster_has_other_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("egovcp.bounds.available_cores", lambda: 1)
-    for command, path in (("egovcp-collect", "num_workers"), ("egovcp-experiment", "jobs")):
-        changes = {"backend": "ray", path: 1000}
-        if command == "egovcp-experiment":
-            changes["output_dir"] = "x"
-        config = dataclasses.replace(_default(command), **changes)
-        check_cores(config)
-        config.check()
-
-
 @pytest.mark.parametrize(
     ("command", "flags"),
     [

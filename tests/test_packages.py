@@ -117,15 +117,12 @@ def names_the_extra(result: LimitedResult) -> bool:
 
 #: Command line of a distribution that is installed alone -> the extra that it needs.
 NEED_EXTRAS = {
-    "egovcp-collect --task=ball --dataset.root=out --backend=ray": "egovcp-collect[ray]",
     "egovcp-dataset viz data --output=out": "egovcp-collect[viz]",
     "egovcp-deploy --policy.path=policy --robot.type=sim --output_dir=out": "egovcp-deploy[sim]",
     "egovcp-demo": "egovcp-deploy[sim]",
     "egovcp-eval --policy.path=policy --task=ball --output_dir=out": "egovcp-deploy[sim]",
     "egovcp-eval-lowlevel --output_dir=out": "egovcp-train[sim]",
-    "egovcp-export --policy.path=policy --output_dir=out": "egovcp-train[onnx]",
     "egovcp-fake-g1 --task=ball": "egovcp-deploy[sim]",
-    "egovcp-mcap from-dataset data out --episode=0": "egovcp-deploy[data]",
     "egovcp-mcap to-dataset run.mcap --dataset.root=out": "egovcp-deploy[data]",
     "egovcp-task check ball": "egovcp-deploy[sim]",
     "egovcp-train --dataset.root=data --output_dir=out --eval_closed_loop=1": "egovcp-train[sim]",

@@ -22,7 +22,7 @@ from egovcp.data import tiff
 from egovcp.data.committer import Committer, open_committer
 from egovcp.data.source import local_root
 from egovcp.errors import EnvironmentFailure
-from egovcp.packages import require_packages
+from egovcp.hardware import available_cores
 from egovcp.robot_spec import G1
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
@@ -33,7 +33,7 @@ from egovcp.workers import stop_on_signal
 from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_collect.provenance import make_provenance, require_compatible
 from egovcp_collect.worker_pool import WorkerPool
-from egovcp_collect.workers import Backend, LocalBackend
+from egovcp_collect.workers import WorkerGroup
 
 PROG: Final = "egovcp-collect"
 _EPILOG: Final = (
@@ -79,8 +79,6 @@ def collect(config: CollectConfig, command: str = "") -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
-    if config.backend == "ray":
-        require_packages("egovcp-collect", "--backend=ray", "ray")
     config = replace(config, env=resolve_config(config.env, config.tasks))
     provenance = make_provenance(config, command)
     check_existing = partial(require_compatible, provenance) if config.resume else None
@@ -160,21 +158,13 @@ def _simulate(
     """Planner ticks until every episode is staged, or until a stop signal."""
     if not scenarios:
         return 0
-    if config.backend == "ray":
-        from egovcp_collect.ray_workers import RayBackend
-
-        backend: Backend = RayBackend(config)
-    else:
-        backend = LocalBackend(config, committer.staging.folder)
-    count = config.num_workers or backend.cores
-    pool = WorkerPool(backend, count, scenarios, config.num_envs, config.worker_timeout)
+    group = WorkerGroup(config, committer.staging.folder)
+    count = config.num_workers or available_cores()
+    pool = WorkerPool(group, count, scenarios, config.num_envs, config.worker_timeout)
     steps, began = 0, time.monotonic()
     with stop_on_signal() as stopped, closing(pool):
         while not pool.done and not stopped:
             for report in pool.poll():
-                for episode in report.staged:
-                    episode.verify()
-                    committer.staging.put(episode)
                 for number in report.finished:
                     committer.mark_staged(number)
                 steps += report.steps

@@ -42,11 +42,8 @@ class CollectConfig:
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
     """Episode i depends on (seed, i) only, not on the number of workers."""
-    backend: Literal["local", "ray"] = "local"
-    """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
-    egovcp-collect[ray])."""
     num_workers: int = bounded(0, least=0, most=65_536)
-    """Simulation processes; 0: one per processor core, of the cluster under --backend=ray."""
+    """Simulation processes; 0: one per processor core."""
     worker_timeout: float = bounded(120.0, least=1)
     """Replace a worker that sends no report for this long, s."""
     num_envs: int = bounded(16, least=1, most=65_536)
@@ -67,11 +64,10 @@ class CollectConfig:
         check_bounds(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
-        if self.backend == "local":  # a cluster has other cores and other memory
-            require_cores("--num_workers", self.num_workers)
-            workers = self.num_workers or available_cores()
-            robots = min(self.num_envs * workers, self.episodes)
-            require_memory_for_robots("--num_envs", self.num_envs, robots)
+        require_cores("--num_workers", self.num_workers)
+        workers = self.num_workers or available_cores()
+        robots = min(self.num_envs * workers, self.episodes)
+        require_memory_for_robots("--num_envs", self.num_envs, robots)
         for task in set(self.mix) - set(select_tasks(self.task, training=True)):
             raise UsageError(f"--mix.{task}: --task={self.task} does not have this task")
         shortest, longest = self.step_ticks

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 import draccus
@@ -14,6 +14,7 @@ from egovcp.errors import UsageError
 from egovcp.flags import merged
 from egovcp.sim.robot_env import controller_id_of
 from egovcp.sim.tasks.registry import ALL_TASKS, task_names
+from egovcp.values import differences
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 
 _PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy")
@@ -72,8 +73,8 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
-        **dict(_flat_pairs("--", migrate_config(before.config), migrate_config(now.config))),
-        **dict(_flat_pairs("version of ", versions, now.versions)),
+        **dict(differences(migrate_config(before.config), migrate_config(now.config), "--")),
+        **dict(differences(versions, now.versions, "version of ")),
     }
     changed = {
         name: f"{name} was {old}, is {new}"
@@ -99,15 +100,3 @@ def _unused_prefixes(*collections: Provenance) -> tuple[str, ...]:
     used = {task for c in collections for task in migrate_config(c.config)["task"].split(",")}
     unused = [task for task in task_names() if task not in used]
     return tuple(f"--env.{task}{end}" for task in unused for end in (".", "_episode."))
-
-
-def _flat_pairs(
-    prefix: str, before: Mapping[str, Any], now: Mapping[str, Any]
-) -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """Dotted name, and old and new value, of each leaf of nested settings."""
-    for name in {**before, **now}:
-        old, new = before.get(name), now.get(name)
-        if isinstance(old, Mapping) and isinstance(new, Mapping):
-            yield from _flat_pairs(f"{prefix}{name}.", old, new)
-        else:
-            yield f"{prefix}{name}", (old, new)

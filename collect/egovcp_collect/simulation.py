@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,6 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import REWARD_TERMS
 from egovcp_collect.config import CollectConfig
 
-#: Called with the environment and (B,) whether the episode of each row is running.
-type StepCallback = Callable[[BaseVectorEnv, NDArray[np.bool_]], None]
-
-
 type SimulationResult = tuple[int, list[tuple[int, Episode]]]
 """Planner ticks, summed over the robots; number and content of each finished episode."""
 
@@ -33,16 +29,10 @@ class Simulation:
 
     Args:
         config: the options in `EPISODE_OPTIONS`, and ``num_envs``.
-        on_step: called before each planner tick, with the state that the next row records.
-        render_depth: False leaves depth empty, which is faster; nothing else changes.
     """
 
-    def __init__(
-        self, config: CollectConfig, on_step: StepCallback | None = None, render_depth: bool = True
-    ) -> None:
+    def __init__(self, config: CollectConfig) -> None:
         self._config = config
-        self._on_step = on_step
-        self._render_depth = render_depth
         self._waiting: deque[Scenario] = deque()
         self._policy = RandomWalk(config.eta, config.boundary, config.step_ticks)
         self._env: BaseVectorEnv | None = None
@@ -66,8 +56,6 @@ class Simulation:
             env = self._start_waiting()
             running, objects = ~env.done, env.known_objects()
             steps += int(running.sum())
-            if self._on_step is not None:
-                self._on_step(env, running)
             result = env.step(self._policy.act(env))
             for row in np.flatnonzero(running).tolist():
                 instance, record = env.instances[row], self._records[row]
@@ -84,7 +72,7 @@ class Simulation:
         if env is None:
             scenarios = self._take(config.num_envs)
             self._records = [EpisodeRecord() for _ in scenarios]
-            env = make_env(config.env, len(scenarios), config.tasks, self._render_depth)
+            env = make_env(config.env, len(scenarios), config.tasks)
             self._env = env
             self._observation = env.reset(scenarios)
             self._policy.reset(env, scenarios)

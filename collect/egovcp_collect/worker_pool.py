@@ -15,7 +15,7 @@ from typing import Final
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.workers import Backend, Worker, WorkerReport
+from egovcp_collect.workers import Worker, WorkerGroup, WorkerReport
 
 MAX_ATTEMPTS: Final = 3
 """How many workers may die on the same episode before the collection stops."""
@@ -32,7 +32,7 @@ class _PoolWorker:
 
 
 class WorkerPool:
-    """Workers of a backend.
+    """Assigns episodes to workers, and replaces workers that are lost.
 
     Args:
         workers: how many to start.
@@ -42,13 +42,13 @@ class WorkerPool:
 
     def __init__(
         self,
-        backend: Backend,
+        group: WorkerGroup,
         workers: int,
         scenarios: Iterable[Scenario],
         num_envs: int,
         timeout: float,
     ) -> None:
-        self._backend = backend
+        self._group = group
         self._waiting = deque(scenarios)
         self._num_envs = num_envs
         self._timeout = timeout
@@ -56,8 +56,6 @@ class WorkerPool:
         self._workers: list[_PoolWorker] = []
         self._lost: Counter[int] = Counter()
         self._invalid: Counter[int] = Counter()
-        self.replaced = 0
-        """Workers that died or timed out."""
 
     @property
     def done(self) -> bool:
@@ -67,7 +65,6 @@ class WorkerPool:
     def close(self) -> None:
         """End all workers."""
         with ExitStack() as stack:  # an error while one worker ends does not leave the others
-            stack.callback(self._backend.close)
             for worker in self._workers:
                 stack.callback(worker.worker.kill)
 
@@ -81,7 +78,7 @@ class WorkerPool:
         """
         while len(self._workers) < self._count:
             self._start_worker()
-        self._backend.wait(_POLL_S)
+        self._group.wait(_POLL_S)
         reports = [report for worker in list(self._workers) for report in self._poll_worker(worker)]
         for worker in self._workers:
             self._refill(worker)
@@ -113,7 +110,6 @@ class WorkerPool:
             self._count_lost(worker, cause)
         else:
             raise cause
-        self.replaced += 1
         self._waiting.extendleft(reversed(worker.unfinished.values()))
 
     def _count_invalid(self, worker: _PoolWorker, cause: DataError) -> None:
@@ -139,7 +135,7 @@ class WorkerPool:
     def _start_worker(self) -> None:
         """Start a worker with an equal share of the waiting episodes."""
         share = -(-len(self._waiting) // (self._count - len(self._workers)))
-        worker = _PoolWorker(self._backend.start())
+        worker = _PoolWorker(self._group.start())
         self._workers.append(worker)
         self._assign(worker, min(2 * self._num_envs, share))
 

@@ -1,4 +1,4 @@
-"""The interface of simulation workers, and workers that are processes of this machine."""
+"""Simulation workers, which are processes of this machine."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from egovcp.data import Episode
 from egovcp.data.staging import EncodedEpisode, StagedEpisode, StagingDir, encode
 from egovcp.errors import DataError
-from egovcp.hardware import available_cores
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_collect.config import CollectConfig
@@ -35,44 +34,8 @@ class WorkerReport:
     """Planner ticks."""
     finished: tuple[int, ...] = ()
     """Numbers of the episodes that it finished."""
-    staged: tuple[StagedEpisode, ...] = ()
-    """Those that it could not stage on the disk itself."""
     error: Exception | None = None
     """The error that ended the worker; this is its last report."""
-
-
-class Worker(Protocol):
-    """A process that simulates episodes."""
-
-    def assign(self, scenarios: Sequence[Scenario]) -> None:
-        """Append episodes to its queue."""
-
-    def poll(self) -> list[WorkerReport]:
-        """Reports since the last call; does not block."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether more reports can follow."""
-
-    def kill(self) -> None:
-        """End it immediately; returns when it has ended."""
-
-
-class Backend(Protocol):
-    """Starts workers."""
-
-    def start(self) -> Worker:
-        """Start a worker."""
-
-    @property
-    def cores(self) -> int:
-        """Processor cores that workers can use."""
-
-    def wait(self, seconds: float) -> None:
-        """Block until a worker has reported or died, at most this long."""
-
-    def close(self) -> None:
-        """Free the resources of the backend itself."""
 
 
 def encode_episode(number: int, episode: Episode) -> EncodedEpisode:
@@ -97,7 +60,7 @@ def picklable(error: Exception) -> Exception:
     return error
 
 
-class LocalWorker(Worker):
+class Worker:
     """A process that stages its episodes on the disk itself; reports come through a pipe."""
 
     def __init__(self, config: CollectConfig, staging: Path) -> None:
@@ -111,12 +74,14 @@ class LocalWorker(Worker):
         remote.close()
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Append episodes to its queue."""
         try:
             self.pipe.send(list(scenarios))
         except OSError:  # the process is dying; the pool assigns the episodes again
             self.process.join(timeout=1)
 
     def poll(self) -> list[WorkerReport]:
+        """Reports since the last call; does not block."""
         reports: list[WorkerReport] = []
         try:
             while self.pipe.poll():
@@ -127,38 +92,35 @@ class LocalWorker(Worker):
 
     @property
     def alive(self) -> bool:
+        """Whether more reports can follow."""
         return self.process.is_alive()
 
     def kill(self) -> None:
+        """End it immediately; returns when it has ended."""
         self.process.kill()
         self.process.join()
         self.pipe.close()
 
 
-class LocalBackend(Backend):
-    """Starts processes that stage episodes in the folder ``staging``."""
+class WorkerGroup:
+    """Starts workers that stage episodes in the folder ``staging``, and waits for them."""
 
     def __init__(self, config: CollectConfig, staging: Path) -> None:
         self._config = config
         self._staging = staging
-        self._workers: list[LocalWorker] = []
+        self._workers: list[Worker] = []
 
-    @property
-    def cores(self) -> int:
-        return available_cores()
-
-    def start(self) -> LocalWorker:
-        worker = LocalWorker(self._config, self._staging)
+    def start(self) -> Worker:
+        """Start a worker."""
+        worker = Worker(self._config, self._staging)
         self._workers = [*self._running(), worker]
         return worker
 
     def wait(self, seconds: float) -> None:
+        """Block until a worker has reported or died, at most this long."""
         wait([x for w in self._running() for x in (w.pipe, w.process.sentinel)], timeout=seconds)
 
-    def close(self) -> None:
-        pass  # the pool ends the processes
-
-    def _running(self) -> list[LocalWorker]:
+    def _running(self) -> list[Worker]:
         return [worker for worker in self._workers if not worker.pipe.closed]
 
 

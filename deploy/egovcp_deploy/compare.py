@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +11,7 @@ from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
 from egovcp.files import read_json
 from egovcp.terminal import echo
+from egovcp.values import differences
 from egovcp_deploy.scores import EpisodeScore, aligned, eval_scores, paired
 
 PROG: Final = "egovcp-compare"
@@ -113,7 +114,7 @@ def compare(config: CompareConfig) -> None:
     echo(f"{config.controller} of {run.folder} compared with {other_controller} of {other.folder}")
     for each in dict.fromkeys(e.folder for e in (run, other) if not e.complete):
         echo(f"{each} is incomplete: egovcp-eval was interrupted")
-    for name, run_value, other_value in _differences(run.config, other.config):
+    for name, (run_value, other_value) in differences(run.config, other.config):
         if name not in _IRRELEVANT:
             echo(f"--{name}: {run_value} (RUN), {other_value} (OTHER)")
     echo(aligned([_HEAD, *lines], text_columns=1))
@@ -165,19 +166,3 @@ def _line(
         reward,
         reward_range,
     )
-
-
-def _differences(
-    run: Mapping[str, Any], other: Mapping[str, Any], prefix: str = ""
-) -> Iterator[tuple[str, Any, Any]]:
-    """(dotted name, value, the other's value) wherever two configurations differ."""
-    for key in [*run, *(key for key in other if key not in run)]:
-        run_value, other_value = run.get(key), other.get(key)
-        if isinstance(run_value, Mapping) and isinstance(other_value, Mapping):
-            yield from _differences(run_value, other_value, f"{prefix}{key}.")
-        elif run_value != other_value:
-            yield f"{prefix}{key}", run_value, other_value
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

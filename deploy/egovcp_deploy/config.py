@@ -11,7 +11,7 @@ from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.options import encoded
+from egovcp_deploy.options import SEEDS, encoded
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -79,7 +79,7 @@ class DeployConfig:
     one episode, --env.sequence.parts), or package.module:Class. It is no input of the policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenarios."""
     output_dir: str = ""
     """New folder for recordings and summary."""

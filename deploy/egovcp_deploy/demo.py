@@ -15,6 +15,7 @@ from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.deploy import check_options, show_viewer
+from egovcp_deploy.options import SEEDS
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.rollouts import play_rollouts
 
@@ -39,7 +40,7 @@ class DemoConfig:
     """Changes to the artifact's planner."""
     task: str = "sequence"
     """Scene: sequence (arch, ball and wall in turn), or another of `egovcp-task list`."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenario."""
     live: str = ""
     """Also show the episode as it is played: web (a page for browsers), or spawn (the Rerun
@@ -81,7 +82,3 @@ def demo(config: DemoConfig) -> None:
         path.rename(folder / f"rollout{path.suffix}")
     echo(f"video: {folder / 'rollout.gif'}")
     show_viewer(folder / "rollout.rrd")
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

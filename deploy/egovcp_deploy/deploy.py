@@ -15,7 +15,7 @@ from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.dry_run import checks, conclude
 from egovcp_deploy.live.drive import drive, drive_simulated
-from egovcp_deploy.options import PLANNER, check_output_dir, check_seed
+from egovcp_deploy.options import PLANNER, check_output_dir
 from egovcp_deploy.robots.realsense_camera import require_realsense
 from egovcp_deploy.rollouts import play_rollouts, replay
 
@@ -63,7 +63,6 @@ def show_viewer(rrd: Path) -> None:
 def check_options(config: DeployConfig) -> None:
     """Raise `UsageError` or `EnvironmentFailure` for what can be known before any work starts."""
     robot = config.robot.type
-    check_seed(config.seed)
     if config.controller == PLANNER:
         config.policy.require("choose a reference that needs none, such as --controller=oracle")
     elif robot != "sim" or config.realtime:
@@ -90,7 +89,3 @@ def check_options(config: DeployConfig) -> None:
     if config.robot.camera.type == "realsense":
         require_realsense()
     check_output_dir(config.output_dir)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -41,6 +41,8 @@ from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
 
 Array = NDArray[np.float64]
 type AnyCamera = ZmqDepthCamera | RealSenseDepthCamera
+#: Name, and the function that returns the finding.
+type Check = tuple[str, Callable[[], str]]
 
 FREE_BYTES: Final = 1_000_000_000  # an hour of recording takes about 0.6 GB
 PLAN_BUDGET_MS: Final = 36.0
@@ -56,54 +58,36 @@ RANGE_MARGIN: Final = 0.1  # rad beyond the joint range; more is a wrong zero
 MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1.0
 
 
-@dataclass(frozen=True)
-class CheckResult:
-    """Result of one check."""
-
-    name: str
-    finding: str
-    error: EgovcpError | None = None  # why no run is possible; None: go
-
-    def __str__(self) -> str:
-        if self.error is None:
-            return f"go     {self.name}: {self.finding}"
-        return f"NO-GO  {self.name}: {self.error}"
-
-
-def check(name: str, function: Callable[[], str]) -> CheckResult:
-    """The finding that ``function`` returns, or the `EgovcpError` that it raises."""
-    try:
-        return CheckResult(name, function())
-    except EgovcpError as error:
-        return CheckResult(name, "", error)
-
-
-def conclude(results: Iterable[CheckResult]) -> None:
-    """Print each result as it comes, then go; raises the first error, if any."""
+def conclude(pending: Iterable[Check]) -> None:
+    """Perform each check and print its result, then go; raises the first error, if any."""
     errors = []
-    for result in results:
-        echo(str(result))
-        if result.error is not None:
-            errors.append(result.error)
+    for name, check in pending:
+        try:
+            echo(f"go     {name}: {check()}")
+        except EgovcpError as error:
+            echo(f"NO-GO  {name}: {error}")
+            errors.append(error)
     if errors:
         echo(f"no-go: {len(errors)} checks failed")
         raise errors[0]
     echo("go")
 
 
-def checks(config: DeployConfig) -> Iterator[CheckResult]:
-    """All checks of a run on a robot; a failed one does not prevent the others."""
-    yield check("disk", lambda: check_disk(Path(config.output_dir)))
+def checks(config: DeployConfig) -> Iterator[Check]:
+    """All checks of a run on a robot, each to be performed before the next is requested; a failed
+    one does not prevent the others."""
     artifact: Artifact | None = None
-    try:
+
+    def check_policy() -> str:
+        nonlocal artifact
         artifact = load_policy(config.policy, config.planner)
-    except EgovcpError as error:
-        yield CheckResult("policy", "", error)
-    else:
+        return f"{artifact.path}, for the controller {artifact.controller_id}"
+
+    yield "disk", lambda: check_disk(Path(config.output_dir))
+    yield "policy", check_policy
+    if artifact is not None:
         policy = artifact.make_policy(1, config.seed)
-        finding = f"{artifact.path}, for the controller {artifact.controller_id}"
-        yield CheckResult("policy", finding)
-        yield check("planner", lambda: check_plan_time(policy))
+        yield "planner", lambda: check_plan_time(policy)
     yield from check_hardware(config, artifact)
 
 
@@ -156,7 +140,7 @@ class Measurements:
     image_ages_ms: list[float] = field(default_factory=list)  # at their arrival
 
 
-def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[CheckResult]:
+def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[Check]:
     """Controller, robot and camera."""
 
     def check_controller() -> str:
@@ -165,7 +149,7 @@ def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[
             artifact.require_controller(found)
         return found
 
-    yield check("controller", check_controller)
+    yield "controller", check_controller
     limits = config.robot.limits
     with ExitStack() as stack:
         robot: BridgeRobot | None = None
@@ -185,22 +169,22 @@ def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[
             stack.callback(camera.close)
             return "answers"
 
-        yield check("robot", check_robot)
-        yield check("camera", check_camera)
+        yield "robot", check_robot
+        yield "camera", check_camera
         measured = measure(robot, camera, LISTEN_S)
         now = time.monotonic_ns()
         if robot is not None:
             yield from _robot_results(robot, measured, robot.arrivals.stats(now, LISTEN_S), limits)
         if camera is not None:
             images, gap_ms = camera.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
-            yield check("images", lambda: check_message_rate(images, IMAGE_HZ, gap_ms))
+            yield "images", lambda: check_message_rate(images, IMAGE_HZ, gap_ms)
             max_ms = config.env.delay.image_age[1] * 1e3
-            yield check("image age", lambda: image_age(measured.image_ages_ms, max_ms))
+            yield "image age", lambda: image_age(measured.image_ages_ms, max_ms)
 
 
 def _robot_results(
     robot: BridgeRobot, measured: Measurements, states: ArrivalStats, limits: Limits
-) -> Iterator[CheckResult]:
+) -> Iterator[Check]:
     """Checks of the robot's messages; none if no state was received."""
     reading = measured.reading
     if reading is None:
@@ -212,13 +196,13 @@ def _robot_results(
         return "none detected"
 
     mode = f"mode machine {reading.mode}: 29 joints, waist free"
-    yield CheckResult("mode", robot.warning or mode)
-    yield check("joints", lambda: joint_offsets(reading.joint_position))
-    yield check("posture", lambda: check_posture(reading))
-    yield check("motors", lambda: motors(measured))
+    yield "mode", lambda: robot.warning or mode
+    yield "joints", lambda: joint_offsets(reading.joint_position)
+    yield "posture", lambda: check_posture(reading)
+    yield "motors", lambda: motors(measured)
     gap_ms = limits.state_hold_s * 1e3
-    yield check("states", lambda: check_message_rate(states, STATE_HZ, gap_ms))
-    yield check("other publishers", check_publishers)
+    yield "states", lambda: check_message_rate(states, STATE_HZ, gap_ms)
+    yield "other publishers", check_publishers
 
 
 def measure(robot: BridgeRobot | None, camera: AnyCamera | None, seconds: float) -> Measurements:

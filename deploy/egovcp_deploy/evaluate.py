@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
-from egovcp.errors import UsageError
+from egovcp.errors import UsageError, suggest
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.packages import require_packages
@@ -38,9 +38,8 @@ from egovcp_deploy.controllers import (
 from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.options import (
     PLANNER,
-    check_choice,
+    SEEDS,
     check_output_dir,
-    check_seed,
     encoded,
     held_out,
     make_output_dir,
@@ -93,7 +92,7 @@ class EvalConfig:
     several in one episode (--env.sequence.parts)."""
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
     """Separated by commas: planner, hold (neutral pose), constant (best fixed action), random (the
@@ -131,11 +130,11 @@ class EvalConfig:
             if "oracle" in self.controller_names and not find_task(task).has_oracle():
                 raise UsageError(f"task {task} has no oracle; leave it out of --controllers")
         for name in self.controller_names:
-            check_choice("--controllers", name, (*CONTROLLERS, PPO))
+            if name not in (known := (*CONTROLLERS, PPO)):
+                raise UsageError(f"unknown value --controllers={name}{suggest(name, known)}")
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
         require_memory_for_robots("--num_envs", self.num_envs, robots)
-        check_seed(self.seed)
         if PLANNER in self.controller_names:
             self.policy.require("leave planner out of --controllers")
         if PPO in self.controller_names and not self.ppo.path:
@@ -319,7 +318,3 @@ def _groups(
 def _score_json(score: EpisodeScore) -> dict[str, Any]:
     omitted = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
     return {name: value for name, value in asdict(score).items() if name not in omitted}
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

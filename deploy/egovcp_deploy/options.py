@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
 from functools import reduce
 from importlib.metadata import version
 from operator import getitem
@@ -12,39 +11,27 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp.errors import EnvironmentFailure, UsageError, suggest
+from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
 from egovcp.packages import is_installed
 from egovcp.sim.scenario import HELD_OUT, SEARCH, Scenario
 
 PLANNER: Final = "planner"
+SEEDS: Final = SEARCH - HELD_OUT
+"""Number of seeds of held-out scenarios."""
 _PACKAGES: Final = ("egovcp", "egovcp-deploy", "torch", "numpy")
 
 
 def held_out(task: str, seed: int, episode: int) -> Scenario:
-    """Scenario ``episode`` of evaluation and deployment for the user's ``seed``; raises
-    `UsageError` if the seed is negative or leaves the range of held-out scenarios."""
-    return Scenario(task, HELD_OUT + check_seed(seed), episode)
+    """Scenario ``episode`` of evaluation and deployment for the user's ``seed``, from 0 to
+    `SEEDS` - 1."""
+    return Scenario(task, HELD_OUT + seed, episode)
 
 
 def for_search(task: str, seed: int, episode: int) -> Scenario:
-    """Scenario ``episode`` of the search for the best constant action; raises as `held_out`."""
-    return Scenario(task, SEARCH + check_seed(seed), episode)
-
-
-def check_seed(seed: int) -> int:
-    """Return ``seed``; raises `UsageError` outside the range of held-out scenarios."""
-    if not 0 <= seed < SEARCH - HELD_OUT:
-        raise UsageError(f"--seed={seed}: expected a number from 0 to {SEARCH - HELD_OUT - 1}")
-    return seed
-
-
-def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
-    """Raise `UsageError` unless ``value`` is one of ``valid``."""
-    choices = tuple(valid)
-    if value not in choices:
-        raise UsageError(f"unknown value {flag}={value}{suggest(value, choices)}")
+    """Scenario ``episode`` of the search for the best constant action; see `held_out`."""
+    return Scenario(task, SEARCH + seed, episode)
 
 
 def check_output_dir(path: str) -> Path:

@@ -14,14 +14,14 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
-from egovcp.log.sink import Fanout, Sink
-from egovcp.log.tick import CameraView, RunInfo
+from egovcp.log.tick import CameraView, Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo
 from egovcp_deploy.options import versions, video_paths
 
 if TYPE_CHECKING:
+    from egovcp.log.viewer import Viewer
     from egovcp_deploy.config import DeployConfig
 
 
@@ -40,22 +40,37 @@ class LogOptions:
 
 
 @contextmanager
+def open_viewer(options: LogOptions) -> Iterator[Viewer | None]:
+    """The viewer of ``--log.live``, for all rollouts of a run; None without that option."""
+    if not options.live:
+        yield None
+        return
+    from egovcp.log.viewer import LiveRerun  # takes half a second
+
+    with LiveRerun.of(options.live) as live:
+        if live.page:
+            echo(f"Rerun viewer: {live.page}")
+        yield live.viewer
+
+
+@contextmanager
 def recording(
-    folder: Path, episode: int, info: RunInfo, options: LogOptions, blocking: bool
+    folder: Path,
+    episode: int,
+    info: RunInfo,
+    options: LogOptions,
+    viewer: Viewer | None,
+    blocking: bool,
 ) -> Iterator[Sink]:
     """Sinks of rollout number ``episode``. If ``blocking``, the loop may wait for the disk, as in
     simulated time; else each sink, like any viewer, runs in a separate process."""
     with ExitStack() as stack:
         files = _file_sinks(folder / f"rollout-{episode}", episode, options)
         viewers = list[AsyncSink]()
-        if options.live:
-            from egovcp.log.rerun import RerunSink  # takes half a second
-            from egovcp.log.viewer import LiveRerun
+        if viewer is not None:
+            from egovcp.log.rerun import RerunSink
 
-            live = stack.enter_context(LiveRerun.of(options.live))
-            if live.page:
-                echo(f"Rerun viewer: {live.page}")
-            viewers.append(AsyncSink(RerunSink(live.viewer), "Rerun"))
+            viewers.append(AsyncSink(RerunSink(viewer), "Rerun"))
         sink: Sink
         if blocking:
             sink = Fanout([*files.values(), *viewers])

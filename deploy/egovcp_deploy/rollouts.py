@@ -18,9 +18,8 @@ from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.files import write_json
-from egovcp.log.sink import Sink
-from egovcp.log.tick import Tick
-from egovcp.rate import NS_PER_S, LockstepClock
+from egovcp.log.tick import Sink, Tick
+from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir
@@ -36,7 +35,7 @@ from egovcp_deploy.pilot.planner import (
     planner_fields,
 )
 from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State
-from egovcp_deploy.recording import percentiles, provenance, recording, run_info
+from egovcp_deploy.recording import open_viewer, percentiles, provenance, recording, run_info
 from egovcp_deploy.robots.base import RobotObservation
 from egovcp_deploy.robots.replay import ReplayRobot, open_recordings
 
@@ -74,21 +73,12 @@ class RolloutSummary:
 
 
 class LockstepRunner:
-    """Drives one robot with one planner on the same simulated ``clock``, until the robot ends the
-    rollout. ``operator`` maps the index of a step to a request."""
+    """Drives one robot with one planner in simulated time, until the robot ends the rollout."""
 
     def __init__(
-        self,
-        planner: PlannerClient,
-        robot: SimRobot | ReplayRobot,
-        clock: LockstepClock,
-        limits: Limits | None = None,
-        operator: Callable[[int], OperatorRequest | None] = lambda index: None,
+        self, planner: PlannerClient, robot: SimRobot | ReplayRobot, limits: Limits | None = None
     ) -> None:
-        self._planner, self._limits = planner, limits
-        self._robot = robot
-        self._clock = clock
-        self._operator = operator
+        self._planner, self._robot, self._limits = planner, robot, limits
 
     def run(
         self, sink: Sink, on_tick: Callable[[Tick], None] = lambda tick: None
@@ -103,7 +93,6 @@ class LockstepRunner:
             summary.add(tick)
             summary.parts = self._parts
             on_tick(tick)
-            self._clock.advance(self._period_ns)
         if self._pilot.supervisor.state is State.DAMP:
             summary.damped = self._pilot.supervisor.reason
         return summary
@@ -148,11 +137,10 @@ class LockstepRunner:
 
     def _plan(self, index: int, sensed: RobotObservation) -> PlanMessage | None:
         """Update the state machine and plan; None: no plan within the step."""
-        pilot, now = self._pilot, self._clock.now_ns()
+        pilot, now = self._pilot, index * self._period_ns
         pilot.sense(now, sensed.state, sensed.depth)
         before = pilot.supervisor.state
-        request = OperatorRequest.RUN if index == 0 else self._operator(index)
-        state = pilot.update_state(Facts(now), request)
+        state = pilot.update_state(Facts(now), OperatorRequest.RUN if index == 0 else None)
         if index == 0 and state is State.RUN:
             pilot.take_events()  # every simulated rollout starts in RUN: not worth a log line
         if state is State.DAMP and before is not State.DAMP:
@@ -164,7 +152,9 @@ class LockstepRunner:
 def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
     """Play and record rollouts of the simulated robot; complete ones are summarised in any case.
     Returns the output folder. Raises as `deploy`."""
-    robot = make_robot(config)
+    from egovcp_deploy.robots.sim import SimRobot  # needs the simulator
+
+    robot = SimRobot(config.env, config.task, config.seed)
     try:
         config = replace(config, env=robot.env.config)  # as resolved for its controller
         policy: RolloutPolicy
@@ -191,13 +181,6 @@ def replay(config: DeployConfig, artifact: Artifact) -> Path:
     return _play(config, artifact, robot, artifact.make_policy(1, config.seed))
 
 
-def make_robot(config: DeployConfig) -> SimRobot:
-    """The robot of ``--robot.type=sim``; importing it needs the simulator."""
-    from egovcp_deploy.robots.sim import SimRobot
-
-    return SimRobot(config.env, config.task, config.seed)
-
-
 def _play(
     config: DeployConfig,
     artifact: Artifact | None,
@@ -208,11 +191,14 @@ def _play(
     if artifact is not None:
         planner.warm_up()
     folder = make_output_dir(config.output_dir)
-    clock, backend = LockstepClock(), backend_of(policy)
-    runner = LockstepRunner(InlinePlanner(planner, clock), robot, clock, config.robot.limits)
+    backend = backend_of(policy)
+    runner = LockstepRunner(InlinePlanner(planner), robot, config.robot.limits)
     summaries: list[RolloutSummary] = []
     try:
-        with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
+        with (
+            open_viewer(config.log) as viewer,
+            tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar,
+        ):
             for episode in range(config.episodes):
                 robot.start(episode)
                 info = run_info(
@@ -224,7 +210,7 @@ def _play(
                     robot.camera,
                     robot.spec,
                 )
-                with recording(folder, episode, info, config.log, blocking=True) as sink:
+                with recording(folder, episode, info, config.log, viewer, blocking=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:

@@ -17,7 +17,7 @@ from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.tasks.registry import find_task, name_problem, register_task, task_entries
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
-from egovcp_deploy.options import make_output_dir
+from egovcp_deploy.options import SEEDS, make_output_dir
 
 COMMANDS: Final = CommandGroup(
     "egovcp-task",
@@ -108,7 +108,7 @@ class PlayTaskConfig:
     """hold (neutral pose), random (the paper's walk), or oracle (the task's scripted solution)."""
     episodes: int = bounded(1, least=1, most=1_000_000)
     """Number of episodes."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenarios, as in egovcp-eval."""
     output_dir: str = ""
     """New folder for rollout-<i>.rrd, .gif and .mcap."""
@@ -182,7 +182,3 @@ def run_new(config: NewTaskConfig) -> None:
         f"wrote {folder}; next:\n  pip install -e {folder}\n  egovcp-task check {name}\n"
         f"  egovcp-task play {name} --output_dir=play-{name}\n  pytest {folder}"
     )
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from egovcp.log.tick import Tick
+from egovcp.log.picture import AHEAD, PictureSink
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import NS_PER_S
-from egovcp.robot_spec import G1
 from egovcp.sim.base_env import BaseVectorEnv, Observation
 from egovcp_deploy.options import video_paths
 from egovcp_deploy.pilot.planner import RolloutPolicy
@@ -23,28 +23,25 @@ class VideoRecorder:
     """
 
     def __init__(self, stems: Sequence[Path]) -> None:
-        self._stems = stems
-        self._robot = G1
-        self._ticks: list[list[Tick]] = [[] for _ in stems]
+        self._sinks = [PictureSink(*video_paths(stem)) for stem in stems]
+        self._index = 0  # of o_t
 
     def add(
         self, env: BaseVectorEnv, observation: Observation, policy: RolloutPolicy, step: PolicyStep
     ) -> None:
         """Keep o_t and what the model imagines; call it before ``env`` advances."""
-        self._robot = env.robot
-        rows = [i for i in range(len(self._stems)) if not env.done[i]]
+        rows = [i for i in range(len(self._sinks)) if not env.done[i]]
         if not rows:
             return
-        from egovcp.log.picture import AHEAD
-
         imagined = policy.imagine(step.plan, AHEAD) if isinstance(policy, Policy) else None
         for i in rows:
             base, scene = true_poses(env, i)
-            index = len(self._ticks[i])
-            self._ticks[i].append(
+            if self._index == 0:
+                self._sinks[i].open(RunInfo("", robot=env.robot))
+            self._sinks[i].write(
                 Tick(
-                    index=index,
-                    time_ns=index * NS_PER_S // env.robot.planner_hz,
+                    index=self._index,
+                    time_ns=self._index * NS_PER_S // env.robot.planner_hz,
                     depth=observation.depth[i].copy(),
                     state=observation.state[i].copy(),
                     action_planned=step.action[i],
@@ -54,12 +51,9 @@ class VideoRecorder:
                     depth_imagined=None if imagined is None else imagined[i],
                 )
             )
+        self._index += 1
 
     def write(self) -> None:
         """Draw the files."""
-        if not self._stems:
-            return  # matplotlib may be missing
-        from egovcp.log.picture import write_videos
-
-        for stem, ticks in zip(self._stems, self._ticks, strict=True):
-            write_videos(ticks, video_paths(stem), self._robot)
+        for sink in self._sinks:
+            sink.close()

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
 from egovcp.checks.feature_statistics import numbers_in
-from egovcp.checks.lerobot_dataset import STALE, Progress, lerobot_problems, split_problems
+from egovcp.checks.lerobot_dataset import STALE, LeRobotCheck, Progress, lerobot_problems
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, Episode, metadata, schema, stats
-from egovcp.data.lerobot import is_own
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
 from egovcp.data.metadata import hash_problems
-from egovcp.data.parquet import EPISODE_FEATURES, data_errors, open_parquet
+from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.provenance import DuplicateFinder
 from egovcp.data.source import Source, locate
+from egovcp.data.staging import encode, with_index
 from egovcp.errors import DataError
 
 _RELATIVE = 1e-4  # of the column's range: statistics may be float32
@@ -54,23 +54,29 @@ def dataset_problems(
     if reader is None:
         return
     yield from _file_problems(reader)
-    yield from _raised(_table_problems(reader))
+    table = LeRobotReader(root)
+    check = LeRobotCheck(table)
+    yield from table.problems
+    yield from check.table_problems()
+    yield from _task_problems(reader, table.rows)
     duplicates = DuplicateFinder[int]()
-    total, table = StatisticsCheck(reader), EpisodeStatistics(reader)
+    matrices: list[stats.Matrix] = []
     for index in range(len(reader)):
         episode, problems = reader.inspect(index)
         yield from problems
-        matrix = None
         if episode is not None and not problems:
             for frame, problem in command_problems(episode):
                 yield DataError.at(reader.data_path(index), problem, index, frame)
-            matrix = total.add(episode)
-            digest = reader.digest(index) or episode.digest()
-            yield from _duplicate_problems(reader, duplicates, index, digest)
-        yield from _raised(table.problems(index, matrix))
+            encoded = encode(episode)
+            matrices.append(with_index(encoded, 0, 0, 0)[1])
+            yield from _duplicate_problems(reader, duplicates, index, encoded.record["sha256"])
+            if index in check.by_number:
+                row = check.by_number[index]
+                yield from _episode_statistics_problems(reader, row, matrices[-1])
         if progress is not None:
             progress(index + 1, len(reader))
-    yield from _raised(total.problems())
+    if not table.problems:
+        yield from _total_problems(reader, table.stats, matrices)
 
 
 def _open(root: Path) -> Generator[DataError, None, DatasetReader | None]:
@@ -158,105 +164,45 @@ def _content_problems(reader: DatasetReader, path: Path, frames: int) -> Iterato
         yield DataError.at(path, problem)
 
 
-def _table_problems(reader: DatasetReader) -> Iterator[DataError]:
-    """Tasks and splits that do not agree with the episodes."""
-    path, info = reader.root / schema.INFO_PATH, reader.info
-    if info.get("total_tasks") != len(reader.task_names):
-        found = f"total_tasks is {info.get('total_tasks')}"
-        yield DataError.at(path, f"{found}, but {schema.TASKS_PATH} lists {len(reader.task_names)}")
-    yield from (DataError.at(path, text) for text in split_problems(info, len(reader)))
-    index = 0
-    for file in metadata.episode_files(reader.root):
-        with data_errors(file):
-            listed = open_parquet(file).read(columns=["tasks"])["tasks"].to_pylist()
-        for tasks in listed:
-            if tasks != [reader.task(index)]:
-                problem = f"its tasks are {tasks}, expected {reader.task(index)}"
-                yield DataError.at(file, problem, index)
-            index += 1
+def _task_problems(reader: DatasetReader, rows: Sequence[EpisodeRow]) -> Iterator[DataError]:
+    """Episodes whose tasks in ``meta/episodes`` and ``meta/collection.json`` differ."""
+    for row in rows:
+        if row.tasks != [reader.task(row.index)]:
+            problem = f"its tasks are {row.tasks}, expected {reader.task(row.index)}"
+            yield DataError.at(row.file, problem, row.index)
 
 
-class StatisticsCheck:
-    """Compares ``meta/stats.json`` with the statistics of all frames."""
-
-    def __init__(self, reader: DatasetReader) -> None:
-        self._reader = reader
-        self._frames = 0
-        self._total: stats.Matrix | None = None
-
-    def add(self, episode: Episode) -> stats.Matrix:
-        """Add a valid episode; returns the statistics (R, D) of its frames."""
-        matrix = _statistics(self._reader, episode)
-        parts = [matrix] if self._total is None else [self._total, matrix]
-        counts = [len(episode)] if self._total is None else [self._frames, len(episode)]
-        self._total = stats.aggregate(parts, counts)
-        self._frames += len(episode)
-        return matrix
-
-    def problems(self) -> Iterator[DataError]:
-        """Differences from ``meta/stats.json``, if all frames of the dataset were added."""
-        path = self._reader.root / schema.STATS_PATH
-        found = self._reader.stats
-        for key in self._reader.features:
-            if not isinstance(found.get(key), dict):
-                yield DataError.at(path, f"has no statistics of {key}")
-        if self._total is None or self._frames != self._reader.num_frames:
-            return
-        places = stats.layout(self._reader.robot)
-        for key in _checked(self._reader):
-            if isinstance(found.get(key), dict):
-                for problem in _differences(found[key], self._total[:, places[key]], self._frames):
-                    yield DataError.at(path, f"{key}: {problem}")
+def _episode_statistics_problems(
+    reader: DatasetReader, row: EpisodeRow, matrix: stats.Matrix
+) -> Iterator[DataError]:
+    """Differences of the statistics in ``meta/episodes`` from those (R, D) of the frames."""
+    for key, part in _checked(reader):
+        for problem in _differences(row.stats(key), matrix[:, part], row.length):
+            yield DataError.at(row.file, f"statistics of {key}: {problem}", row.index)
 
 
-class EpisodeStatistics:
-    """Compares the statistics in ``meta/episodes`` with the frames, file by file."""
-
-    def __init__(self, reader: DatasetReader) -> None:
-        self._reader = reader
-        self._rows = self._all_rows()
-
-    def problems(self, index: int, matrix: stats.Matrix | None) -> Iterator[DataError]:
-        """Differences from the table's row of an episode; call it for every episode in order.
-
-        ``matrix`` are the statistics (R, D) of its frames; None: unknown.
-        """
-        found_row = next(self._rows, None)
-        if found_row is None or matrix is None:
-            return
-        path, row = found_row
-        places = stats.layout(self._reader.robot)
-        for key in _checked(self._reader):
-            prefix = f"stats/{key}/"
-            found = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
-            length = int(self._reader.lengths[index])
-            for problem in _differences(found, matrix[:, places[key]], length):
-                yield DataError.at(path, f"statistics of {key}: {problem}", index)
-
-    def _all_rows(self) -> Iterator[tuple[Any, Mapping[str, Any]]]:
-        for path in metadata.episode_files(self._reader.root):
-            with data_errors(path):
-                file = open_parquet(path)
-                names = [n for n in file.schema_arrow.names if n.startswith("stats/")]
-                for group in range(file.num_row_groups):
-                    for row in file.read_row_group(group, columns=names).to_pylist():
-                        yield path, row
+def _total_problems(
+    reader: DatasetReader, found: Mapping[str, Any], matrices: list[stats.Matrix]
+) -> Iterator[DataError]:
+    """Differences of ``meta/stats.json`` from the frames; ``matrices`` (R, D) are the statistics of
+    the valid episodes."""
+    path = reader.root / schema.STATS_PATH
+    for key in reader.features:
+        if not isinstance(found.get(key), dict):
+            yield DataError.at(path, f"has no statistics of {key}")
+    if len(matrices) != len(reader):
+        return
+    total = stats.aggregate(matrices, reader.lengths.tolist())
+    for key, part in _checked(reader):
+        if isinstance(found.get(key), dict):
+            for problem in _differences(found[key], total[:, part], reader.num_frames):
+                yield DataError.at(path, f"{key}: {problem}")
 
 
-def _checked(reader: DatasetReader) -> Iterator[str]:
-    """The features whose statistics are compared."""
-    return (key for key in reader.features if key not in STALE)
-
-
-def _statistics(reader: DatasetReader, episode: Episode) -> stats.Matrix:
-    columns = {key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()}
-    depth = columns.pop(spec.DEPTH_KEY)
-    frames = np.arange(len(episode), dtype=np.int64)
-    places: dict[str, NDArray[np.generic]] = {
-        **dict.fromkeys(schema.INDEX_FEATURES, frames),  # those in STALE are not compared
-        "timestamp": (frames / reader.fps).astype(np.float32),
-    }
-    return np.concatenate([stats.data_stats(depth, columns), stats.index_stats(places)], axis=1)
+def _checked(reader: DatasetReader) -> Iterator[tuple[str, slice]]:
+    """The features whose statistics are compared, and their columns of a matrix."""
+    places = stats.layout(reader.robot)
+    return ((key, places[key]) for key in reader.features if key not in STALE)
 
 
 def _differences(found: Mapping[str, object], part: stats.Matrix, frames: int) -> Iterator[str]:

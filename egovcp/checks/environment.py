@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,55 +12,17 @@ from egovcp import spec
 from egovcp.errors import ConformanceError
 from egovcp.robot_spec import G1, RobotSpec
 
+if TYPE_CHECKING:
+    from egovcp.sim.base_env import BaseVectorEnv, Observation, StepResult
+    from egovcp.sim.scenario import Scenario
+
 COMMAND_TOLERANCE = 1e-4  # m; float32 rounding of a command
 
 type Array = NDArray[np.floating]
 
 
-class _Observation(Protocol):
-    @property
-    def depth(self) -> NDArray[np.uint16]: ...
-
-    @property
-    def state(self) -> NDArray[np.float32]: ...
-
-
-class _Step[O: _Observation](Protocol):
-    @property
-    def observation(self) -> O: ...
-
-    @property
-    def reward(self) -> Array: ...
-
-    @property
-    def reward_terms(self) -> Mapping[str, Array]: ...
-
-    @property
-    def terminated(self) -> NDArray[np.bool_]: ...
-
-    @property
-    def truncated(self) -> NDArray[np.bool_]: ...
-
-    @property
-    def success(self) -> NDArray[np.bool_]: ...
-
-    @property
-    def sent_action(self) -> Array: ...
-
-
-class Environment[S, O: _Observation](Protocol):
-    """The interface of a vectorised environment that collection and evaluation use."""
-
-    @property
-    def num_envs(self) -> int: ...
-
-    def reset(self, scenarios: Sequence[S]) -> O: ...
-
-    def step(self, action: Array) -> _Step[O]: ...
-
-
-def check_env[S, O: _Observation](
-    env: Environment[S, O], scenarios: Sequence[S], ticks: int = 20, seed: int = 0
+def check_env(
+    env: BaseVectorEnv, scenarios: Sequence[Scenario], ticks: int = 20, seed: int = 0
 ) -> None:
     """Run the scenarios twice under the same random actions and check every tick.
 
@@ -80,8 +42,8 @@ def check_env[S, O: _Observation](
                 )
 
 
-def _run_actions[S, O: _Observation](
-    env: Environment[S, O], scenarios: Sequence[S], actions: Array, robot: RobotSpec
+def _run_actions(
+    env: BaseVectorEnv, scenarios: Sequence[Scenario], actions: Array, robot: RobotSpec
 ) -> list[dict[str, NDArray[np.generic]]]:
     """Observation and reward of each tick; tick 0 is the reset."""
     sent: Array = np.zeros((env.num_envs, robot.action_dim))
@@ -99,11 +61,11 @@ def _run_actions[S, O: _Observation](
     return history
 
 
-def _arrays(observation: _Observation) -> dict[str, NDArray[np.generic]]:
+def _arrays(observation: Observation) -> dict[str, NDArray[np.generic]]:
     return {"depth": observation.depth.copy(), "state": observation.state.copy()}
 
 
-def _check_observation(observation: _Observation, sent: Array, t: int, robot: RobotSpec) -> None:
+def _check_observation(observation: Observation, sent: Array, t: int, robot: RobotSpec) -> None:
     depth, state, rows = observation.depth, observation.state, len(sent)
     layout: dict[str, tuple[NDArray[Any], tuple[int, ...], type[np.generic]]] = {
         "depth": (depth, (rows, *robot.depth), np.uint16),
@@ -133,7 +95,7 @@ def _check_sent(sent: Array, before: Array, t: int) -> None:
     _require(np.abs(sent).max() <= 1 + 1e-6, t, "the action sent leaves [-1, 1]")
 
 
-def _check_step[O: _Observation](step: _Step[O], finished: NDArray[np.bool_], t: int) -> None:
+def _check_step(step: StepResult, finished: NDArray[np.bool_], t: int) -> None:
     terms = np.sum(list(step.reward_terms.values()), axis=0)
     done = step.terminated | step.truncated
     both = step.terminated & step.truncated

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -61,21 +60,8 @@ def camera_statistics_problems(found: Mapping[str, object], feature: Feature) ->
 
 def numbers_in(value: object) -> NDArray[np.float64] | None:
     """Nested lists of numbers as a flat array; None if they hold other values."""
-    flat: list[float] = []
-    waiting = [value]
-    while waiting:
-        item = waiting.pop()
-        if isinstance(item, list):
-            waiting += reversed(item)
-        elif isinstance(item, int | float) and not isinstance(item, bool):
-            flat.append(_as_float(item))
-        else:
-            return None
-    return np.array(flat, dtype=np.float64)
-
-
-def _as_float(number: float) -> float:
     try:
-        return float(number)
-    except OverflowError:  # an integer beyond 1.8e308
-        return math.inf
+        array = np.array(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return array.ravel().astype(np.float64) if array.dtype.kind in "iuf" else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,32 +11,9 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.artifact import Artifact, load_artifact
 from egovcp.errors import ArtifactError, ConformanceError
-from egovcp.model import Carry
+from egovcp.model import Carry, WorldModel
 
 TOLERANCE = 1e-4  # rounding of network outputs
-
-
-class RecurrentModel(Protocol):
-    """The methods of a world model that filtering and planning use; shapes as in `WorldModel`."""
-
-    @property
-    def min_return(self) -> Tensor: ...
-
-    def initial(self, batch: int) -> Carry: ...
-
-    def observe(
-        self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
-    ) -> Carry: ...
-
-    def expand_candidates(self, carry: Carry) -> Carry: ...
-
-    def imagine(self, carry: Carry, action: Tensor) -> Carry: ...
-
-    def value(self, carry: Carry, action: Tensor) -> Tensor: ...
-
-    def termination(self, carry: Carry) -> Tensor: ...
-
-    def decode(self, carry: Carry) -> tuple[Tensor, Tensor]: ...
 
 
 class RandomInputs:
@@ -53,7 +29,7 @@ class RandomInputs:
 
 
 @torch.no_grad()
-def check_world_model(model: RecurrentModel, seed: int = 0) -> None:
+def check_world_model(model: WorldModel, seed: int = 0) -> None:
     """Check the contract that filtering on the robot and planning rely on.
 
     Raises:
@@ -82,7 +58,7 @@ def check_world_model(model: RecurrentModel, seed: int = 0) -> None:
     _check_decoder(model, later)
 
 
-def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
+def _check_rows(model: WorldModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
     """Each row of a batch gives the same result alone."""
     continues = torch.zeros(1, dtype=torch.bool)
     for b in range(len(inputs.action)):
@@ -97,7 +73,7 @@ def _row(carry: Carry, row: slice) -> Carry:
     return carry.map(lambda x: x[row])
 
 
-def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
+def _check_planning(model: WorldModel, carry: Carry, plans: Tensor) -> None:
     """imagine, value and termination broadcast (E, 1, ...) states over (E, M, 7) actions."""
     shared = model.expand_candidates(carry)
     before = copy.deepcopy(shared)
@@ -121,7 +97,7 @@ def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
     _same("imagine lets the candidates influence each other", first, alone)
 
 
-def _check_decoder(model: RecurrentModel, carry: Carry) -> None:
+def _check_decoder(model: WorldModel, carry: Carry) -> None:
     depth, state = model.decode(carry)
     found, rows = (tuple(depth.shape), tuple(state.shape)), len(carry.h)
     expected = (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), (rows, spec.STATE_DIM)

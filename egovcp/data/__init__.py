@@ -14,11 +14,6 @@ from egovcp.data.reader import DatasetReader, load_arrays, open_dataset
 from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.data.samplers import InMemorySampler, SamplerConfig, ShuffleConfig, StreamingSampler
 from egovcp.data.store import Batch, EpisodeStore
-from egovcp.data.training_stats import (
-    TrainingStats,
-    compute_training_stats,
-    estimate_training_stats,
-)
 from egovcp.data.writer import DatasetWriter
 
 __all__ = [
@@ -36,10 +31,7 @@ __all__ = [
     "SamplerConfig",
     "ShuffleConfig",
     "StreamingSampler",
-    "TrainingStats",
-    "compute_training_stats",
     "describe_heldout",
-    "estimate_training_stats",
     "is_terminal",
     "load_arrays",
     "mc_return",

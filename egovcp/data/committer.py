@@ -35,7 +35,7 @@ from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.provenance import SOURCES, Provenance, parse_provenance
 from egovcp.data.reader import DatasetReader
 from egovcp.data.source import Source
-from egovcp.data.staging import EncodedEpisode, StagingDir
+from egovcp.data.staging import EncodedEpisode, StagingDir, encode
 from egovcp.data.writer import VersionContents, VersionWriter, publish_version, recover, shard_paths
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.files import removed_on_error
@@ -239,14 +239,14 @@ def load_append_state(root: Path) -> AppendState:
             "`egovcp-dataset repair` writes a copy that can"
         )
     shards = []
-    for number in range(-(-episodes // size)):
+    full = episodes // size
+    kept = full * size
+    for number in range(full):
         path = root / shard_paths(number)[1]
         with data_errors(path):
             shards.append(open_parquet(path).read())
     matrices = [stats.from_arrow(shard, reader.robot) for shard in shards]
     lengths = [shard["length"].to_pylist() for shard in shards]
-    full = episodes // size
-    kept = full * size
     present = {record["task"] for record in reader.records[:kept]}
     contents = VersionContents(
         size,
@@ -256,9 +256,7 @@ def load_append_state(root: Path) -> AppendState:
         {name: hashes[name] for number in range(full) for name in shard_paths(number)},
         reader.robot,
     )
-    tail = []
-    if kept < episodes:
-        tail = _read_tail(reader, full, kept, matrices[full])
+    tail = [encode(reader.read(index)) for index in range(kept, episodes)]
     return AppendState(contents, tail, reader.origin, _next_number(reader))
 
 
@@ -283,22 +281,3 @@ def _next_number(reader: DatasetReader) -> int:
             problem = f"is number {number} of the collection, as episode {first[number]}"
             raise DataError.at(path, f"{problem}; `egovcp-dataset repair` keeps one", index)
     return max(first, default=-1) + 1
-
-
-def _read_tail(
-    reader: DatasetReader, number: int, kept: int, matrices: list[stats.Matrix]
-) -> list[EncodedEpisode]:
-    """The episodes from index ``kept`` on, which are those of shard ``number``."""
-    path = reader.root / shard_paths(number)[0]
-    records, robot = reader.records[kept:], reader.robot
-    ordered = schema.episode_schema(robot)
-    with data_errors(path):
-        file = open_parquet(path)
-        tables = [
-            file.read_row_group(i, columns=ordered.names).select(ordered.names).cast(ordered)
-            for i in range(len(records))
-        ]
-    return [
-        EncodedEpisode(table, record, matrix[:, stats.data_columns(robot)], robot)
-        for table, record, matrix in zip(tables, records, matrices, strict=True)
-    ]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from egovcp import spec
 from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.data.reader import DatasetReader
@@ -162,6 +163,16 @@ class EpisodeIndex:
         reader, number = self._place(episode)
         columns = reader.read_episode_columns(number, tuple(EPISODE_FEATURES.values()))
         return reader.to_episode(number, columns)
+
+    def state_statistics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean and standard deviation (S,) of the state over all frames, from the statistics of
+        each episode in ``meta/episodes``; no data file is read."""
+        stats = [reader.episode_stats(spec.STATE_KEY) for reader in self.readers]
+        mean, std = (np.stack([stats[d][k][i] for d, i in self._places]) for k in (0, 1))
+        weight = (self.length / self.num_frames)[:, None]
+        total = (weight * mean).sum(0)
+        variance = (weight * (std**2 + (mean - total) ** 2)).sum(0)
+        return total, np.sqrt(variance)
 
     def _place(self, episode: int) -> tuple[DatasetReader, int]:
         return self.readers[int(self.dataset[episode])], int(self.number[episode])

@@ -80,21 +80,6 @@ def group_episodes(
     return EpisodeGroups(of, share / share.sum())
 
 
-class GroupedRows:
-    """Rows sorted by group."""
-
-    def __init__(self, group_of_rows: NDArray[np.int64], groups: int) -> None:
-        self._rows = np.argsort(group_of_rows, kind="stable")
-        self._count = np.bincount(group_of_rows, minlength=groups)
-        self._first = self._count.cumsum() - self._count
-
-    def pick(self, rng: np.random.Generator, group: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Draw a row of each of these groups uniformly; no group may be empty."""
-        place = (rng.random(len(group)) * self._count[group]).astype(np.int64)
-        at = np.minimum(self._first[group] + place, len(self._rows) - 1)
-        return np.asarray(self._rows[at])
-
-
 class EpisodeOrder:
     """Endless epochs over the episodes of each group in the shard of one process."""
 

@@ -77,12 +77,3 @@ def files_below(folder: Path) -> list[Path]:
         linked = [name for name in folders if (parent / name).is_symlink()]
         found += [parent / name for name in [*files, *linked] if not name.startswith(".")]
     return sorted(found)
-
-
-def hidden_files(folder: Path) -> int:
-    """Number of hidden files and folders in ``folder``, at any depth; links are not followed."""
-    if folder.is_symlink():
-        return 0
-    return sum(
-        name.startswith(".") for _, folders, files in folder.walk() for name in (*folders, *files)
-    )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,19 +67,10 @@ _DEPTH_SHIFT: Final = 3.5
 
 def decode_image(content: object, frame: int, key: str) -> Any:
     """The encoded image of a frame as a loaded Pillow image; raises `DataError` with `frame`."""
-    from PIL import Image, UnidentifiedImageError
-
     if not isinstance(content, Mapping) or not content.get("bytes"):
         raise tiff.frame_error(frame, f"{key} has no image in the file")
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            image = Image.open(io.BytesIO(content["bytes"]))
-            image.load()
-    except UnidentifiedImageError as error:
-        raise tiff.frame_error(frame, f"{key} is not an image") from error
-    except Exception as error:  # Pillow's parsers raise many types on damaged files
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise tiff.frame_error(frame, f"{key} is not a readable image: {reason}") from error
+    with tiff.open_image(content["bytes"], frame, key) as image:
+        image.load()
     return image
 
 

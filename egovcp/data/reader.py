@@ -35,7 +35,7 @@ from egovcp.data.parquet import (
 )
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
-from egovcp.data.source import Source, is_local, locate, open_file_cache, select_episodes
+from egovcp.data.source import Source, hub_cache, is_local, locate, select_episodes
 from egovcp.errors import DataError, suggest
 from egovcp.hub import HubFileCache, RetryPolicy, is_local_path
 
@@ -115,7 +115,7 @@ class DatasetReader:
         the revision resolves now."""
         if is_local(config):
             return cls.open(config)
-        cache = open_file_cache(config, retry)
+        cache = HubFileCache(config.repo_id, config.revision, retry, hub_cache(), ["meta/*"])
         return cls(Source(cache.folder, cache.repo_id, cache.commit), cache, _selection(config))
 
     def __len__(self) -> int:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.data.index import EpisodeIndex
-from egovcp.data.order import EpisodeOrder, GroupedRows, Mix, group_episodes
+from egovcp.data.order import EpisodeOrder, Mix, group_episodes
 from egovcp.data.returns import ReturnConfig
 from egovcp.data.store import Batch, EpisodeStore, gather, mirror_windows
 from egovcp.errors import DataError, UsageError
@@ -85,12 +85,12 @@ class InMemorySampler:
         self.store, self.config, self.mix = store, config, mix
         self._part = windows
         self._rng = np.random.default_rng(config.seed)
-        self._batches = 0
         self._fingerprint = store.fingerprint
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
         groups = group_episodes(mix, store.dataset, store.tasks, store.length)
-        self._share = groups.share
-        self._rows = GroupedRows(groups.of[self._episode_of], len(groups.share))
+        group = groups.of[self._episode_of]
+        cumulative = (groups.share / np.bincount(group))[group].cumsum()
+        self._cumulative = cumulative / cumulative[-1]  # probability of each row and those before
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -105,7 +105,6 @@ class InMemorySampler:
         latest = first + np.maximum(store.length[episode] - config.span, 0)
         start = np.clip(rows - offset, first, latest)
         part = self._part
-        self._batches += 1
         batch = gather(store, start[part], episode[part], config.span)
         return _finish(batch, config, rng, store.robot, part)
 
@@ -113,7 +112,6 @@ class InMemorySampler:
         """JSON-compatible state; a sampler that loads it continues with exactly the next batch."""
         return {
             "rng": self._rng.bit_generator.state,
-            "batches": self._batches,
             "config": vars(self.config).copy(),
             "mix": self.mix.as_dict(),
             "fingerprint": self._fingerprint,
@@ -127,16 +125,15 @@ class InMemorySampler:
         _require_same_options(state["config"], vars(self.config))
         _require_same_options(state.get("mix", NO_WEIGHTS.as_dict()), self.mix.as_dict())
         self._rng.bit_generator.state = state["rng"]
-        self._batches = int(state["batches"])
         return self
 
     def _draw_rows(self) -> NDArray[np.int64]:
-        """A row for each window, (B,): all equally likely, or first its group, then the row."""
+        """A row for each window, (B,): all equally likely, or by the weights of their groups."""
         size = self.config.batch_size
         if self.mix.is_plain:
             return self._rng.integers(self.store.num_frames, size=size)
-        groups = self._rng.choice(len(self._share), size=size, p=self._share)
-        return self._rows.pick(self._rng, groups)
+        rows = np.searchsorted(self._cumulative, self._rng.random(size), side="right")
+        return rows.astype(np.int64)
 
 
 class StreamingSampler:
@@ -173,18 +170,12 @@ class StreamingSampler:
         groups = group_episodes(mix, index.dataset, index.tasks, index.length)
         self._order = EpisodeOrder(index, groups, rank, ranks, config.seed)
         self._rng = np.random.default_rng([config.seed, rank])
-        self._batches = 0
         slots = self._shuffle.episodes
         capacity = np.full(slots, int(index.length[self._order.episodes].max()))
         none = np.zeros(slots, dtype=np.int64)
         self._slots = EpisodeStore.empty(capacity, none, robot=index.robot)
         self._held: NDArray[np.int64] = np.full(slots, -1)  # episode in each slot
         self._left = np.zeros(slots, dtype=np.int64)  # windows that each slot has still to yield
-
-    @property
-    def episodes(self) -> NDArray[np.int64]:
-        """The episodes of the index that this sampler draws from."""
-        return self._order.episodes
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -201,14 +192,12 @@ class StreamingSampler:
             parts.append(self._draw_windows(slots))
             wanted -= len(slots)
         batch = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-        self._batches += 1
         return _finish(batch, self.config, self._rng, self.index.robot)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a sampler that loads it continues with exactly the next batch."""
         return {
             "rng": self._rng.bit_generator.state,
-            "batches": self._batches,
             "order": self._order.state_dict(),
             "held": self._held.tolist(),
             "left": self._left.tolist(),
@@ -223,7 +212,6 @@ class StreamingSampler:
             raise UsageError("cannot resume by streaming: the run had its data in memory")
         _require_same_options(state["config"], self._options())
         self._rng.bit_generator.state = state["rng"]
-        self._batches = int(state["batches"])
         self._order.load_state_dict(state["order"])
         self._left = np.array(state["left"])
         for slot, episode in enumerate(state["held"]):

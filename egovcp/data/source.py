@@ -20,7 +20,7 @@ from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError, suggest_path
 from egovcp.files import read_json
-from egovcp.hub import HubFileCache, RetryPolicy, is_repo_id, snapshot
+from egovcp.hub import RetryPolicy, is_repo_id, snapshot
 
 _RETRY_POLICY = RetryPolicy()
 _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
@@ -71,7 +71,7 @@ def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
     if config.root:
         require_folder(root)
         raise DataError(f"no dataset at {root}: {schema.INFO_PATH} is missing")
-    folder = snapshot(config.repo_id, config.revision, retry, cache_dir=_hub_cache())
+    folder = snapshot(config.repo_id, config.revision, retry, cache_dir=hub_cache())
     return Source(folder, config.repo_id, commit=folder.name)
 
 
@@ -87,15 +87,6 @@ def is_local(config: DatasetConfig) -> bool:
     """Whether the dataset is a folder: the root, or LeRobot's if no revision is given."""
     there = (local_root(config) / schema.INFO_PATH).is_file()
     return bool(config.root) or (there and not config.revision)
-
-
-def open_file_cache(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> HubFileCache:
-    """Download the `meta` folder of a dataset on the Hub; the cache downloads its other files.
-
-    If the Hub cannot be reached, a complete `meta` folder of an earlier download is used.
-    """
-    _require_repo_id(config.repo_id)
-    return HubFileCache(config.repo_id, config.revision, retry, _hub_cache(), ["meta/*"])
 
 
 def write_source(source: Source) -> None:
@@ -126,7 +117,7 @@ def _require_repo_id(repo_id: str) -> None:
         raise UsageError(f"--dataset.repo_id={repo_id!r} is not of the form user/name")
 
 
-def _hub_cache() -> Path:
+def hub_cache() -> Path:
     """LeRobot's folder of downloads."""
     return lerobot_home() / "hub"
 

@@ -198,9 +198,6 @@ class StagingDir:
             if _read(path) is None:
                 path.unlink(missing_ok=True)
 
-    def size(self) -> int:
-        return sum(path.stat().st_size for _, path in self._files() if path.exists())
-
     def _files(self) -> Iterator[tuple[int, Path]]:
         for path in sorted(self.folder.iterdir()):
             match = _NAME.fullmatch(path.name)

@@ -35,11 +35,6 @@ def layout(robot: RobotSpec = G1) -> Mapping[str, slice]:
     return slices
 
 
-def data_columns(robot: RobotSpec = G1) -> slice:
-    """Columns of a matrix that `data_stats` fills; `index_stats` fills the rest."""
-    return slice(0, layout(robot)[next(iter(schema.INDEX_FEATURES))].start)
-
-
 def data_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
     """Statistics ``(R, D1)`` of depth (T, H, W), mm, and of `schema.DATA_KEYS`, (T,) or (T, n)."""
     return np.concatenate([_depth_stats(depth), _numeric_stats(columns, schema.DATA_KEYS)], axis=1)

@@ -8,6 +8,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from egovcp.data import privileged
 from egovcp.data.episode import Episode, FrameLayout, frame_layout
@@ -19,6 +20,8 @@ from egovcp.robot_spec import G1, RobotSpec
 type Batch = dict[str, NDArray[Any]]
 
 _FROM_EPISODE: Final = ("depth", "state", "action", "done", "success")
+_VALUES: Final = ("depth", "state", "action", "prev_action", "privileged", "reward", "mc_return")
+_FLAGS: Final = ("done", "success", "terminal_next", "mc_valid")
 
 
 def _arrays(robot: RobotSpec) -> Mapping[str, FrameLayout]:
@@ -96,7 +99,7 @@ class EpisodeStore:
         store = cls.empty(
             index.length, index.dataset, index.tasks, index.identities, images, index.robot
         )
-        for number in range(len(index)):
+        for number in tqdm(range(len(index)), unit="ep", desc="read", delay=1, leave=False):
             store.fill(number, index.read(number), returns or ReturnConfig())
         return store
 
@@ -169,19 +172,8 @@ def gather(
     valid = wanted < end[:, None]
     rows = np.minimum(wanted, end[:, None] - 1)
     t = rows - store.start[episode][:, None]
-    batch: Batch = {
-        name: getattr(store, name)[rows]
-        for name in (
-            "depth",
-            "state",
-            "action",
-            "prev_action",
-            "privileged",
-            "reward",
-            "mc_return",
-        )
-    }
-    for name in ("done", "success", "terminal_next", "mc_valid"):
+    batch: Batch = {name: getattr(store, name)[rows] for name in _VALUES}
+    for name in _FLAGS:
         batch[name] = getattr(store, name)[rows] & valid
     batch |= {"is_first": (t == 0) & valid, "valid": valid, "episode": episode, "t": t}
     return batch

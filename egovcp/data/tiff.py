@@ -11,7 +11,10 @@ from __future__ import annotations
 import io
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -79,24 +82,36 @@ def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | N
 
 
 def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
-    from PIL import Image, UnidentifiedImageError  # needed for other layouts only
+    with open_image(blob, frame, "its depth image", "a TIFF", formats=("TIFF",)) as image:
+        found = f"{image.mode} {image.height}x{image.width}"
+        if image.mode.startswith("I;16") and image.size == (cols, rows):
+            return np.asarray(image).astype(np.uint16)
+    raise frame_error(frame, f"its depth image is {found}, expected uint16 {rows}x{cols}")
+
+
+@contextmanager
+def open_image(
+    blob: bytes,
+    frame: int,
+    name: str,
+    kind: str = "an image",
+    formats: tuple[str, ...] | None = None,
+) -> Iterator[Any]:
+    """An encoded image as a Pillow image, which is decoded in the block; errors are `frame_error`s
+    that call it ``name``."""
+    from PIL import Image, UnidentifiedImageError  # the layout of `encode` does not need it
 
     try:
         with (
             warnings.catch_warnings(action="ignore"),
-            Image.open(io.BytesIO(blob), formats=("TIFF",)) as image,
+            Image.open(io.BytesIO(blob), formats=formats) as image,
         ):
-            mode, size = image.mode, image.size
-            if mode.startswith("I;16") and size == (cols, rows):
-                return np.asarray(image).astype(np.uint16)
+            yield image
     except UnidentifiedImageError as error:
-        raise frame_error(frame, "its depth image is not a TIFF") from error
-    except Exception as error:  # Pillow's parser raises many types on damaged files
+        raise frame_error(frame, f"{name} is not {kind}") from error
+    except Exception as error:  # Pillow's parsers raise many types on damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise frame_error(frame, f"its depth image is not a readable TIFF: {reason}") from error
-    raise frame_error(
-        frame, f"its depth image is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}"
-    )
+        raise frame_error(frame, f"{name} is not {kind} that can be read: {reason}") from error
 
 
 def frame_error(frame: int, problem: str) -> DataError:

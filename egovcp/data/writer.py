@@ -346,9 +346,9 @@ def _aside(folder: Path) -> Path:
 
 
 class DatasetWriter:
-    """Adds episodes one by one to a temporary folder; `finalize` moves it to ``root``.
+    """Context manager that adds episodes one by one to a temporary folder.
 
-    As a context manager it finalizes on success and discards everything on an error.
+    At the end of the block the folder is moved to ``root``; on an error it is removed.
     """
 
     def __init__(
@@ -373,26 +373,15 @@ class DatasetWriter:
         """Validate and append a complete episode (see `Episode.validate`)."""
         self._version.add(encode(episode, f"episode {self.num_episodes}"))
 
-    def finalize(self) -> Path:
-        """Complete the files, move the folder to ``root`` and return it."""
-        try:
-            if self.num_episodes == 0:
-                raise UsageError(f"no episode was written to {self.root}")
-            self._version.close()
-            publish_version(self._version.folder, self.root)
-        except BaseException:
-            self.discard()
-            raise
-        return self.root
-
-    def discard(self) -> None:
-        self._version.discard()
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self.finalize()
-        else:
-            self.discard()
+        try:
+            if kind is None:
+                if self.num_episodes == 0:
+                    raise UsageError(f"no episode was written to {self.root}")
+                self._version.close()
+                publish_version(self._version.folder, self.root)
+        finally:
+            self._version.discard()

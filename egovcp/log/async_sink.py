@@ -18,7 +18,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -26,8 +26,7 @@ from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.log.pipe import Outbox, WriterReport, enlarge, pack
-from egovcp.log.sink import Sink
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import Fanout, RunInfo, Sink, Tick
 from egovcp.terminal import echo
 
 QUEUE_TICKS: Final = 300  # 12 s at 25 Hz: a disk may hang for 10 s without loss
@@ -49,7 +48,6 @@ class AsyncSink:
     Args:
         sink: must be picklable before it is opened.
         name: its name in messages, such as ``rollout-0.mcap``.
-        lossless: block instead of dropping ticks, for a simulation in lock-step.
         queue_ticks: capacity of the queue in this process.
         close_timeout_s: how long `close` waits for queued ticks.
         warn: receives each message, one line.
@@ -60,13 +58,12 @@ class AsyncSink:
         sink: Sink,
         name: str,
         *,
-        lossless: bool = False,
         queue_ticks: int = QUEUE_TICKS,
         close_timeout_s: float = CLOSE_TIMEOUT_S,
         warn: Callable[[str], None] = warn_on_stderr,
     ) -> None:
         self._sink, self.name = sink, name
-        self._lossless, self._capacity = lossless, queue_ticks
+        self._capacity = queue_ticks
         self._close_timeout_s, self._warn = close_timeout_s, warn
         self._process: _WriterProcess | None = None
         self._opened = self._closed = False
@@ -113,8 +110,6 @@ class AsyncSink:
         process = self._process
         assert process is not None, "open the sink before writing to it"
         self._pump()
-        if self._lossless:
-            self._await(lambda: len(process.outbox) < self._capacity, float("inf"))
         if self.failure is not None or len(process.outbox) >= self._capacity:
             self.dropped += 1
             self._gap += 1
@@ -185,19 +180,15 @@ class AsyncSink:
             self._warn(f"{self.name}: not finished in time; it has every tick but no index")
 
 
-class AsyncFanout:
+class AsyncFanout(Fanout[AsyncSink]):
     """A sink that writes to several `AsyncSink`; a tick is serialised once for all of them."""
-
-    def __init__(self, sinks: Sequence[AsyncSink]) -> None:
-        self.sinks = tuple(sinks)
 
     def open(self, info: RunInfo) -> None:
         """Open every sink; if one fails, close all and raise its error."""
         for sink in self.sinks:
             sink.start()
         try:
-            for sink in self.sinks:
-                sink.open(info)
+            super().open(info)
         except BaseException:
             self.close()
             raise
@@ -207,11 +198,6 @@ class AsyncFanout:
         packed = pack(tick)
         for sink in self.sinks:
             sink.write_packed(tick, packed)
-
-    def close(self) -> None:
-        """Close every sink, one after the other."""
-        for sink in self.sinks:
-            sink.close()
 
 
 class _WriterProcess:

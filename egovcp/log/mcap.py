@@ -85,7 +85,7 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
 
-    def open(self, metadata: Mapping[str, str]) -> None:
+    def create(self, metadata: Mapping[str, str]) -> None:
         """Create the file and write the metadata record."""
         try:
             self._file = self._path.open("xb")
@@ -111,7 +111,10 @@ class McapFile:
             self.flush()
             _sync_folder(self._path.absolute().parent)
         except BaseException:
-            self.discard()
+            file, self._file = self._file, None
+            self._path.unlink(missing_ok=True)
+            with suppress(OSError):
+                file.close()
             raise
 
     def add(self, topic: RecordedTopic, index: int, time_ns: int, data: bytes) -> None:
@@ -144,13 +147,6 @@ class McapFile:
             file.flush()
             os.fsync(file.fileno())
 
-    def discard(self) -> None:
-        file, self._file = self._file, None
-        self._path.unlink(missing_ok=True)
-        if file is not None:
-            with suppress(OSError):
-                file.close()
-
     def _channel(self, topic: RecordedTopic) -> int:
         if topic.topic not in self._channels:
             self._channels[topic.topic] = self._writer.register_channel(
@@ -168,28 +164,19 @@ class McapFile:
         return self._schemas[schema.name]
 
 
-class McapSink:
-    """Writes ticks to a new `McapFile`."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = McapFile(path)
+class McapSink(McapFile):
+    """Writes the ticks of a run to a new file."""
 
     def open(self, info: RunInfo) -> None:
         """Create the file and write the metadata record."""
-        self._file.open(info.to_metadata())
+        self.create(info.to_metadata())
         self._view, self._robot = info.camera, info.robot
 
     def write(self, tick: Tick) -> None:
         """Write the messages of the tick and flush the file."""
         for topic, message in encode_tick(tick, self._view, self._robot).items():
-            self._file.add(_recorded_topic(topic), tick.index, tick.time_ns, message)
-        self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
-
-    def discard(self) -> None:
-        self._file.discard()
+            self.add(_recorded_topic(topic), tick.index, tick.time_ns, message)
+        self.flush()
 
 
 @cache

@@ -24,7 +24,7 @@ from egovcp.errors import DataError
 from egovcp.files import UnsafeFileError, open_regular
 from egovcp.log.mcap import METADATA_NAME, RecordedTopic, checksum_matches, without_checksum
 from egovcp.log.mcap_records import MAGIC, RecordFile
-from egovcp.log.messages import Topic, decode_mode, decode_tick, motor_readings
+from egovcp.log.messages import Topic, decode_tick, motor_readings
 from egovcp.log.tick import MotorReadings, RunInfo, Tick
 from egovcp.rate import NS_PER_S
 
@@ -74,9 +74,6 @@ class RawTick:
     def text(self, topic: str) -> str:
         """Text of the log message on ``topic``; empty without one."""
         return "".join(str(message.msg) for message in self._decode({topic}).values())
-
-    def mode(self) -> str:
-        return decode_mode(self._decode({Topic.MODE}).get(Topic.MODE))
 
     def motors(self) -> MotorReadings | None:
         with self._errors():

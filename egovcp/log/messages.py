@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,17 @@ from egovcp.log import ros2
 from egovcp.log.pose import RobotPose, robot_pose
 from egovcp.log.tick import (
     MODES,
-    BasePose,
     CameraView,
     Candidates,
     Hand,
     MotorReadings,
-    SceneObject,
     Tick,
     ValueMap,
 )
 from egovcp.robot.geometry import quaternion
 from egovcp.robot.kinematics import LINK_NAMES
 from egovcp.robot_spec import G1, RobotSpec
-from egovcp.spec import JOINT_NAMES, STATE_SLICES
+from egovcp.spec import JOINT_NAMES, STATE_SLICES, Solid
 
 CAMERA_FRAME: Final = "head_camera_optical"
 _NO_FRAME: Final = ""  # in the camera frame, viewers would draw decoded points into the scene
@@ -103,29 +101,16 @@ def encode_tick(tick: Tick, view: CameraView, robot: RobotSpec = G1) -> dict[Top
     Of another robot than the G1, the model of its links and of its camera is not known: there are
     no transforms, joint states and camera parameters.
     """
-    if not robot.is_g1:
-        return {
-            **_image_messages(tick),
-            **_policy_messages(tick, robot),
-            **_base_messages(tick),
-            **_plan_messages(tick, robot),
-            **_outcome_messages(tick),
-        }
-    pose = robot_pose(tick)
-    return {
-        **_camera_messages(tick, view),
-        Topic.TF: _transform_tree(tick, pose, view),
-        **_robot_messages(tick),
-        **_base_messages(tick),
+    messages = {
+        **_image_messages(tick),
+        **(_g1_messages(tick, view) if robot.is_g1 else {}),
+        **_policy_messages(tick, robot),
         **_plan_messages(tick, robot),
         **_outcome_messages(tick),
     }
-
-
-def _camera_messages(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
-    info = ros2.camera_info(tick.time_ns, CAMERA_FRAME, view)
-    depth, *others = _image_messages(tick).items()
-    return dict([depth, (Topic.CAMERA_INFO, info), *others])
+    if tick.base is not None:
+        messages[Topic.BASE] = ros2.pose_stamped(tick.time_ns, tick.base[:3], tick.base[3:])
+    return messages
 
 
 def _image_messages(tick: Tick) -> dict[Topic, bytes]:
@@ -151,13 +136,14 @@ def _transform_tree(tick: Tick, pose: RobotPose, view: CameraView) -> bytes:
     return ros2.transforms(tick.time_ns, _FRAMES, positions, rotations)
 
 
-def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
+def _g1_messages(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
     position = tick.state[STATE_SLICES["joint_position"]]
     velocity = tick.state[STATE_SLICES["joint_velocity"]]
     effort = () if tick.motors is None else tick.motors.torque
     messages = {
+        Topic.CAMERA_INFO: ros2.camera_info(tick.time_ns, CAMERA_FRAME, view),
+        Topic.TF: _transform_tree(tick, robot_pose(tick), view),
         Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity, effort),
-        **_policy_messages(tick, G1),
     }
     if tick.motors is not None:
         messages |= _motor_messages(tick.motors)
@@ -171,13 +157,6 @@ def _policy_messages(tick: Tick, robot: RobotSpec) -> dict[Topic, bytes]:
         Topic.ACTION: ros2.multi_array(tick.action_sent, [actions]),
         Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [actions]),
     }
-
-
-def _base_messages(tick: Tick) -> dict[Topic, bytes]:
-    if tick.base is None:
-        return {}
-    position, quaternion_w = tick.base.position_w, tick.base.quaternion_w
-    return {Topic.BASE: ros2.pose_stamped(tick.time_ns, position, quaternion_w)}
 
 
 def _motor_messages(motors: MotorReadings) -> dict[Topic, bytes]:
@@ -289,7 +268,7 @@ def decode_tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         base=_base(messages.get(Topic.BASE)),
         scene=_scene(messages.get(Topic.SCENE)),
         events=tuple(log.msg.split("\n")) if log else (),
-        mode=decode_mode(messages.get(Topic.MODE)),
+        mode="".join(name for name, is_in in _scalars(messages.get(Topic.MODE)).items() if is_in),
         motors=motor_readings(messages),
         link=_scalars(messages.get(Topic.LINK)),
         terminated=flags["terminated"],
@@ -332,11 +311,6 @@ def _scalars(message: Any) -> dict[str, float]:
     return dict(zip(names, map(float, message.data), strict=True))
 
 
-def decode_mode(message: Any) -> str:
-    """State of the runner; empty if none was recorded."""
-    return "".join(name for name, is_in in _scalars(message).items() if is_in)
-
-
 def _image(message: Any) -> NDArray[np.uint16]:
     return np.frombuffer(message.data, "<u2").reshape(message.height, message.width)
 
@@ -368,27 +342,20 @@ def _value_maps(messages: Mapping[str, Any]) -> tuple[ValueMap, ...]:
     return tuple(maps)
 
 
-def _base(message: Any) -> BasePose | None:
+def _base(message: Any) -> NDArray[np.float64] | None:
     if message is None:
         return None
     p, q = message.pose.position, message.pose.orientation
-    return BasePose(np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z]))
+    return np.array([p.x, p.y, p.z, q.w, q.x, q.y, q.z])
 
 
-def _scene(message: Any) -> tuple[SceneObject, ...]:
+def _scene(message: Any) -> tuple[Solid, ...]:
     if message is None:
         return ()
     names = [label.split(":") for label in message.layout.dim[0].label.split(",")]
-    rows = _array(message).tolist()
-    return tuple(
-        SceneObject(name, "sphere" if shape == "sphere" else "box", *_split(row))
-        for (name, shape), row in zip(names, rows, strict=True)
-    )
-
-
-type _Triple = tuple[float, float, float]
-
-
-def _split(row: list[float]) -> tuple[_Triple, tuple[float, float, float, float], _Triple]:
-    x, y, z, qw, qx, qy, qz, sx, sy, sz = row
-    return (x, y, z), (qw, qx, qy, qz), (sx, sy, sz)
+    scene = []
+    for (name, shape), row in zip(names, _array(message), strict=True):
+        x, y, z = row[7:].tolist()
+        kind: Literal["sphere", "box"] = "sphere" if shape == "sphere" else "box"
+        scene.append(Solid(name, kind, (x, y, z), row[:3], row[3:7]))
+    return tuple(scene)

@@ -18,8 +18,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
-from egovcp.log.sink import Sink
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import RunInfo, Sink, Tick
 
 _LENGTH: Final = struct.Struct("!i")
 _PIPE_BYTES: Final = 1 << 20  # several ticks; the default of 64 KiB does not hold one

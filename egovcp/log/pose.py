@@ -76,8 +76,8 @@ def _place(tick: Tick, height: float, tilt: Array, positions: Array, rotations: 
     if tick.base is None:
         origin, pelvis = np.array([0.0, 0.0, height]), tilt
     else:
-        origin = np.asarray(tick.base.position_w, np.float64)
-        pelvis = rotation_matrix(tick.base.quaternion_w)
+        origin = np.asarray(tick.base[:3], np.float64)
+        pelvis = rotation_matrix(tick.base[3:])
     positions_w = origin + positions @ pelvis.T
     rotations_w = pelvis @ rotations
     palms = np.stack([rotations_w[i] @ PALM_OFFSET[k] for k, i in enumerate(WRISTS)])

@@ -30,10 +30,10 @@ from egovcp.log.rerun_columns import (
     skeleton_columns,
 )
 from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
-from egovcp.log.tick import CameraView, RunInfo, SceneObject, Tick
+from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.log.viewer import Viewer
 from egovcp.robot_spec import G1, RobotSpec
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, Solid
 
 BATCH_TICKS: Final = 25  # one second
 LIVE_BATCH_TICKS: Final = 3  # for a low delay
@@ -184,7 +184,7 @@ def _times(ticks: Sequence[Tick]) -> list[rr.TimeColumn]:
     ]
 
 
-def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
+def _shape(thing: Solid) -> rr.Boxes3D | rr.Ellipsoids3D:
     if thing.shape == "sphere":
         return rr.Ellipsoids3D(half_sizes=[thing.size], colors=[SPHERE], fill_mode="solid")
     return rr.Boxes3D(half_sizes=[thing.size], colors=[OBSTACLE], fill_mode="solid")

@@ -16,10 +16,10 @@ from egovcp.log import paths
 from egovcp.log.meshes import SPHERE, value_colours
 from egovcp.log.messages import to_millimetres
 from egovcp.log.pose import WRISTS, RobotPose
-from egovcp.log.tick import CameraView, Hand, SceneObject, Tick, ValueMap
+from egovcp.log.tick import CameraView, Hand, Tick, ValueMap
 from egovcp.robot.geometry import quaternion
 from egovcp.robot.kinematics import LINK_NAMES, PARENT
-from egovcp.spec import ACTION_BOX, ACTION_HANDS, STATE_SLICES
+from egovcp.spec import ACTION_BOX, ACTION_HANDS, STATE_SLICES, Solid
 
 Array = NDArray[np.floating]
 
@@ -157,7 +157,7 @@ def _candidates(frames: Sequence[Frame]) -> Columns:
 
 
 def _scene(ticks: Sequence[Tick]) -> Iterator[Columns]:
-    seen: dict[str, list[tuple[Tick, SceneObject]]] = {}
+    seen: dict[str, list[tuple[Tick, Solid]]] = {}
     for tick in ticks:
         for thing in tick.scene:
             seen.setdefault(thing.name, []).append((tick, thing))

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from egovcp.log.meshes import OBSTACLE, SPHERE, LinkMesh
 from egovcp.log.pose import RobotPose, robot_pose
-from egovcp.log.tick import SceneObject, Tick
+from egovcp.log.tick import Tick
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import LINK_NAMES
 from egovcp.robot_spec import G1, RobotSpec
+from egovcp.spec import Solid
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def draw_scene(
     axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     axes.set_axis_off()
     if not robot.is_g1:
-        points = np.array([thing.position_w for thing in tick.scene] or [(0.0, 0.0, 0.0)])
+        points = np.array([thing.position_w for thing in tick.scene] or [np.zeros(3)])
         half = _SMALL_SCENE_M
         axes.set(xlim=(-half, 2 * half), ylim=(-1.5 * half, 1.5 * half))
         axes.set_zlim(0.0, max(half, float(points[:, 2].max())))
@@ -98,14 +99,14 @@ def _robot(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> Iterable[tuple[Ar
             yield vertices[mesh.triangles], np.insert(colours, 3, 1.0, axis=1)
 
 
-def scene_faces(scene: Iterable[SceneObject]) -> Iterable[tuple[Array, Array]]:
+def scene_faces(scene: Iterable[Solid]) -> Iterable[tuple[Array, Array]]:
     """Corners (F, 4, 3) in the world and RGBA (F, 4) of each object; boxes are translucent."""
     for thing in scene:
         if thing.shape == "sphere":
             shape, colour = _sphere(), (*np.divide(SPHERE, 255.0), 1.0)
         else:
             shape, colour = _box(), (*np.divide(OBSTACLE, 255.0), _OBSTACLE_OPACITY)
-        turned = (shape * thing.size) @ rotation_matrix(np.array(thing.quaternion_w)).T
+        turned = (shape * thing.size) @ rotation_matrix(thing.quaternion_w).T
         yield turned + thing.position_w, np.tile(colour, (len(shape), 1))
 
 

@@ -1,50 +1,26 @@
-"""The records of a log: a planner tick, and the description of its run."""
+"""The records of a log, a planner tick and the description of its run; and what writes them."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.geometry import focal_length
 from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, SPEC_VERSION
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, SPEC_VERSION, Solid
 
 Array = NDArray[np.floating]
 
 #: States of the runner of a robot.
 MODES: Final = ("init", "stand", "armed", "run", "hold", "damp")
 type Hand = Literal["left", "right"]
-
-
-@dataclass(frozen=True)
-class SceneObject:
-    """An object in the scene; recorded in simulation only."""
-
-    name: str
-    """Unique within the scene, such as ``wall``."""
-    shape: Literal["sphere", "box"]
-    position_w: tuple[float, float, float]
-    """Centre, m, world frame."""
-    quaternion_w: tuple[float, float, float, float]
-    """Rotation to the world frame, (w, x, y, z)."""
-    size: tuple[float, float, float]
-    """Half extents along its own axes, m; for a sphere three times the radius."""
-
-
-@dataclass(frozen=True)
-class BasePose:
-    """Pose of the pelvis in the world frame, from the simulator; not an input of the policy."""
-
-    position_w: Array
-    """(3,) m."""
-    quaternion_w: Array
-    """(4,) (w, x, y, z)."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +109,11 @@ class Tick:
     success: bool = False
     timing_ms: Mapping[str, float] = field(default_factory=dict)
     """Duration of each part of the tick, ms."""
-    base: BasePose | None = None
-    scene: tuple[SceneObject, ...] = ()
+    base: NDArray[np.float64] | None = None
+    """(7,) position (m) and quaternion (wxyz) of the pelvis in the world, from the simulator; not
+    an input of the policy."""
+    scene: tuple[Solid, ...] = ()
+    """Objects in the scene, in simulation only."""
     events: tuple[str, ...] = ()
     """Human-readable lines: start of the task, contacts, faults."""
     mode: str = ""
@@ -221,3 +200,37 @@ class RunInfo:
             backend=record.get("backend", ""),  # absent in older recordings
             robot=RobotSpec.from_json(json.loads(record[ROBOT_KEY])) if ROBOT_KEY in record else G1,
         )
+
+
+class Sink(Protocol):
+    """Writes the ticks of one run: ``open`` once, ``write`` in time order, ``close`` once."""
+
+    def open(self, info: RunInfo) -> None:
+        """Start the log of a run."""
+
+    def write(self, tick: Tick) -> None:
+        """Write one tick."""
+
+    def close(self) -> None:
+        """Complete the log on disk; further calls do nothing."""
+
+
+class Fanout[S: Sink]:
+    """A sink that writes every tick to several sinks."""
+
+    def __init__(self, sinks: Sequence[S]) -> None:
+        self.sinks = tuple(sinks)
+
+    def open(self, info: RunInfo) -> None:
+        for sink in self.sinks:
+            sink.open(info)
+
+    def write(self, tick: Tick) -> None:
+        for sink in self.sinks:
+            sink.write(tick)
+
+    def close(self) -> None:
+        """Close every sink, even if one fails; its error is raised."""
+        with ExitStack() as stack:
+            for sink in reversed(self.sinks):
+                stack.callback(sink.close)

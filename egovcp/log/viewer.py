@@ -109,10 +109,10 @@ class LiveRerun:
     def pid(self) -> int | None:
         return self._process.pid if self._process else None
 
-    def start(self) -> None:
+    def __enter__(self) -> Self:
         """Start the viewer and wait until it listens; call it from the main thread."""
         if self.kind == "connect":
-            return
+            return self
         ports = [self.viewer.address[1], *([self.web_port] if self.kind == "web" else [])]
         for port in ports:
             _require_free(port)
@@ -125,15 +125,9 @@ class LiveRerun:
             start_new_session=True,
         )
         self._await(ports)
-
-    def __enter__(self) -> Self:
-        self.start()
         return self
 
     def __exit__(self, *details: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         """Stop the web server; a native viewer stays open."""
         if self.kind == "web":
             self._end()

@@ -18,7 +18,7 @@ from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.log.pipe import WriterReport, receive
-from egovcp.log.sink import Sink
+from egovcp.log.tick import Sink
 
 NICENESS: Final = 5  # the control loop has priority on a shared core
 

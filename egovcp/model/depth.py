@@ -22,12 +22,13 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
     dtype = torch.int16 if far <= torch.iinfo(torch.int16).max else torch.int32
     depth = depth_mm.clamp(0, far).to(dtype)
     depth = depth.sub(depth.clamp(max=1).sub(1), alpha=far)  # 0 to far; faster than by a mask
-    depth = _extreme_3x3(_extreme_3x3(depth, torch.minimum), torch.maximum)
+    depth = extreme_3x3(extreme_3x3(depth, torch.minimum), torch.maximum)
     return depth.to(torch.float32).mul_(-1e-3 / max_m).add_(1.0).clamp_(0.0, 1.0)
 
 
-def _extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
-    """(B, H, W) -> maximum or minimum over each pixel's 3 x 3 neighbourhood; no gradient."""
+def extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
+    """(B, H, W) -> `torch.minimum` or `torch.maximum` over each pixel's 3 x 3 neighbourhood; no
+    gradient."""
     for dim in (1, 2):
         size, out = x.shape[dim], x.clone()
         for to, of in ((0, 1), (1, 0)):
@@ -37,23 +38,11 @@ def _extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
     return x
 
 
-def lowest_3x3(x: Tensor) -> Tensor:
-    """(B, H, W) -> the smallest in each pixel's 3 x 3 neighbourhood; no gradient."""
-    return _extreme_3x3(x, torch.minimum)
-
-
-def highest_3x3(x: Tensor) -> Tensor:
-    """(B, H, W) -> the largest in each pixel's 3 x 3 neighbourhood; no gradient."""
-    return _extreme_3x3(x, torch.maximum)
-
-
 def network_image(near: Tensor) -> Tensor:
     """(B, H, W) nearness -> (B, 2, H, W): nearness and validity.
 
     The two channels of a pixel are adjacent in memory (channels last).
     """
-    if torch.onnx.is_in_onnx_export():  # which does not support complex tensors
-        return torch.stack([near, near.sign()], 1)
     return torch.view_as_real(torch.complex(near, near.sign())).permute(0, 3, 1, 2)
 
 

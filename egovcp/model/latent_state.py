@@ -9,8 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from egovcp.model.parallel import row_noise
-
 SHIFT: Final = 0.54  #: softplus(SHIFT) = 1
 
 
@@ -50,11 +48,6 @@ class Gaussian(NamedTuple):
         """Network output (..., 2Z) -> Gaussian; its std is 1 + min_std at zero logits."""
         mean, raw = logits.float().chunk(2, -1)
         return cls(mean, F.softplus(raw + SHIFT) + min_std)
-
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """One reparametrised sample."""
-        noise = row_noise(self.mean.shape, generator, self.mean.device)
-        return self.mean + self.std * noise
 
     def detach(self) -> Gaussian:
         """The same without gradient."""

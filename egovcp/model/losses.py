@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from egovcp import spec
 from egovcp.model.config import LossConfig
-from egovcp.model.depth import highest_3x3, lowest_3x3, nearness
+from egovcp.model.depth import extreme_3x3, nearness
 from egovcp.model.fused_recurrence import filter_window
 from egovcp.model.latent_state import Carry, Gaussian, kl_divergence
 from egovcp.model.parallel import over_all_rows, row_noise
@@ -206,8 +206,10 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 def _changed(near: Tensor, threshold: float) -> Tensor:
     """(B, T - 1, H, W) bool: `moving_pixels` of all frames that have a previous one."""
-    around = (f(near.flatten(0, 1)).view_as(near) for f in (lowest_3x3, highest_3x3))
-    low, high = (x[:, :-1] for x in around)
+    frames = near.flatten(0, 1)
+    low, high = (
+        extreme_3x3(frames, f).view_as(near)[:, :-1] for f in (torch.minimum, torch.maximum)
+    )
     changed = near[:, 1:] > high.add_(threshold)
     changed |= near[:, 1:] < low.sub_(threshold)
     return changed

@@ -56,23 +56,6 @@ class TargetNetwork(nn.Module):
             own.lerp_(new, 1 - decay)
 
 
-@torch.no_grad()
-def td_target(
-    model: WorldModel, carry: Carry, batch: Batch, head: SplitMlp | None = None
-) -> tuple[Tensor, Tensor]:
-    """Targets (B, T) in units of return, and the rows that have one; see `bootstrapped`.
-
-    Args:
-        model: the world model.
-        carry: the filtered states (B, T, ...).
-        batch: the recorded windows.
-        head: value head of Q'; None: the model's.
-    """
-    if head is None:
-        head = model.value_head
-    return bootstrapped(model, batch, model.value_by(head, carry, batch.action))
-
-
 def bootstrapped(model: WorldModel, batch: Batch, values: Tensor) -> tuple[Tensor, Tensor]:
     """r_t + gamma V_{t+1} (B, T) from values V_t (B, T) in units of return, and the rows that have
     one.
@@ -85,6 +68,7 @@ def bootstrapped(model: WorldModel, batch: Batch, values: Tensor) -> tuple[Tenso
     return batch.reward + model.discount * later, batch.valid & known
 
 
+@torch.no_grad()
 def value_targets(
     model: WorldModel,
     carry: Carry,
@@ -109,7 +93,7 @@ def value_targets(
         return privileged_targets(model, batch, critic, action)
     if model.config.loss.q_target == "td":
         assert critic is None or isinstance(critic, SplitMlp)
-        target, usable = td_target(model, carry, batch, critic)
+        target, usable = bootstrapped(model, batch, model.value(carry, batch.action, critic))
     else:
         target, usable = batch.mc_return, batch.valid & batch.mc_valid
     value = (target - model.return_mean) / model.return_std

@@ -241,18 +241,17 @@ class WorldModel(nn.Module):
         return carry.map(lambda x: x[:, None])
 
     # --- heads -----------------------------------------------------------------------
-    def value(self, carry: Carry, action: Tensor) -> Tensor:
-        """Q(h, z, a) in units of return, (...,); equation 5."""
-        return self.standardised_value(carry, action) * self.return_std + self.return_mean
+    def value(self, carry: Carry, action: Tensor, head: SplitMlp | None = None) -> Tensor:
+        """Q(h, z, a) in units of return, (...,); equation 5.
 
-    def value_by(self, head: SplitMlp, carry: Carry, action: Tensor) -> Tensor:
-        """Q by another head than the model's own, such as a target network, (...,)."""
+        Args:
+            carry: the states (...,).
+            action: (..., 7).
+            head: another head than the model's own, such as a target network.
+        """
+        head = self.value_head if head is None else head
         q = value.read(head(carry.h, carry.z, action), self.config.value_loss)
         return q * self.return_std + self.return_mean
-
-    def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
-        """(Q - mean of the returns) / standard deviation of the returns, (...,)."""
-        return value.read(self.value_head(carry.h, carry.z, action), self.config.value_loss)
 
     def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
         """Loss of Q against the standardised return (...,), (...,)."""

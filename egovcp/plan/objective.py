@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from egovcp.errors import UsageError
 from egovcp.plan.config import PlannerConfig
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
@@ -33,7 +32,11 @@ class PlanEvaluator[C](Protocol):
 
 
 class Dynamics[L](Protocol):
-    """The part of a world model that planning uses; leading dimensions (E, M) broadcast."""
+    """The part of a world model that planning uses; leading dimensions (E, M) broadcast.
+
+    The objectives with rewards also need its ``discount`` and ``reward``, latent=sample its
+    ``imagine_sample``.
+    """
 
     @property
     def min_return(self) -> Tensor:
@@ -56,30 +59,6 @@ class Dynamics[L](Protocol):
     def termination(self, carry: L) -> Tensor:
         """Probability that this state is a failure, (E, M)."""
         ...
-
-
-def _with_rewards(model: Any) -> Any:
-    """Return ``model``; raises `UsageError` without ``discount`` and ``reward(carry, action)``."""
-    if not (hasattr(model, "reward") and hasattr(model, "discount")):
-        raise UsageError(
-            f"{type(model).__name__} has no reward and discount; plan with objective=value"
-        )
-    return model
-
-
-def _transition(model: Any, config: PlannerConfig, generator: torch.Generator | None) -> Any:
-    """``imagine``, or under ``latent=sample`` ``imagine_sample``, of a model.
-
-    Raises:
-        UsageError: the model cannot sample.
-    """
-    if config.latent == "mean":
-        return model.imagine
-    if not hasattr(model, "imagine_sample"):
-        raise UsageError(
-            f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
-        )
-    return partial(model.imagine_sample, generator=generator)
 
 
 class ReferenceEvaluator[L](NamedTuple):
@@ -105,17 +84,14 @@ class ReturnAccumulator:
 
     Args:
         config: objective and termination rule.
-        model: a `Dynamics`; with rewards under ``reward`` and ``td``.
+        model: a `Dynamics`; with ``discount`` under ``reward`` and ``td``.
         steps: of a plan, `PlannerConfig.actions`.
-
-    Raises:
-        UsageError: the model lacks a head that the objective needs.
     """
 
-    def __init__(self, config: PlannerConfig, model: Dynamics[Any], steps: int) -> None:
+    def __init__(self, config: PlannerConfig, model: Any, steps: int) -> None:
         self._config, self._steps = config, steps
         self._is_mean = config.objective == "value"
-        self._discount = 1.0 if self._is_mean else _with_rewards(model).discount
+        self._discount = 1.0 if self._is_mean else model.discount
         self._floor = 0.0 if config.termination_rule == "paper" else model.min_return
         self._weight: Tensor | float = 1.0
         self._survival: Tensor | float = 1.0
@@ -172,27 +148,29 @@ def evaluate[L](
     Raises:
         UsageError: the model lacks a head that the objective needs.
     """
+    rewarded: Any = model  # rewards are no part of `Dynamics`
     accumulator = ReturnAccumulator(config, model, actions.shape[-2])
     states = _states(model, carry, actions, config, generator)
     for k, (state, action) in enumerate(zip(states, actions.unbind(-2), strict=True)):
         if accumulator.needs_value(k):
             accumulator.add_value(model.value(state, action))
         else:
-            accumulator.add_reward(_with_rewards(model).reward(state, action))
+            accumulator.add_reward(rewarded.reward(state, action))
         if accumulator.needs_termination(k):
             accumulator.add_termination(model.termination(state))
     return accumulator.plan_value()
 
 
-def _states[L](
-    model: Dynamics[L],
-    carry: L,
+def _states(
+    model: Any,
+    carry: Any,
     actions: Tensor,
     config: PlannerConfig,
     generator: torch.Generator | None,
-) -> Iterator[L]:
+) -> Iterator[Any]:
     """The states in which the actions are taken: the robots' present ones, then imagined ones."""
-    imagine = _transition(model, config, generator)
+    sampled = config.latent == "sample"
+    imagine = partial(model.imagine_sample, generator=generator) if sampled else model.imagine
     carry = model.expand_candidates(carry)
     yield carry
     for action in actions.unbind(-2)[:-1]:

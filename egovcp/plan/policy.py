@@ -24,7 +24,6 @@ type Array = NDArray[np.float32]
 
 LARGEST_STATE: Final = 1e3
 """Bound of all quantities of the proprioception, in the units of `spec.STATE_SLICES`."""
-_WARM_UP_PLANS: Final = 2
 
 
 _NONE: Final[Array] = np.zeros(0, np.float32)
@@ -166,16 +165,6 @@ class Policy:
             plan.iterations,
             self.skipped.copy(),
         )
-
-    def warm_up(self) -> None:
-        """Make unused plans and `reset`: the first plans compile, pack and allocate.
-
-        Raises:
-            UsageError, EnvironmentFailure: as `prepare`.
-        """
-        for _ in range(_WARM_UP_PLANS):
-            self.act(*blank_observation(self.num_envs, self.model.robot))
-        self.reset()
 
     def prepare(self) -> PlanEvaluator[Carry]:
         """Pack the planner, and compile it if necessary.

@@ -93,28 +93,6 @@ class Plan(NamedTuple):
     iterations: int
 
 
-class Deadline:
-    """Predicts whether another iteration ends in time, from the slowest so far.
-
-    Args:
-        remaining: seconds until the deadline; None: no deadline.
-    """
-
-    def __init__(self, remaining: Callable[[], float] | None) -> None:
-        self._remaining = remaining
-        self._slowest = 0.0
-        self._left = remaining() if remaining else 0.0
-
-    def allows_iteration(self) -> bool:
-        """Call after each iteration."""
-        if self._remaining is None:
-            return True
-        left = self._remaining()
-        self._slowest = max(self._slowest, self._left - left)
-        self._left = left
-        return left > self._slowest
-
-
 def until(deadline_s: float) -> Callable[[], float]:
     """Seconds left until ``deadline_s`` of `time.perf_counter`."""
     return lambda: deadline_s - time.perf_counter()
@@ -139,10 +117,10 @@ def make_plan[C](
         warm: (E, N, 7) deltas of the previous plan, already shifted; None: zeros.
         generator: of the samples, which all robots share: a robot's plan does not depend on the
             other robots.
-        remaining: seconds until the result is due. The search stops if another iteration would
-            end later, but does at least one.
+        remaining: seconds until the result is due. The search stops if another iteration, as long
+            as the slowest so far, would end later, but does at least one.
     """
-    deadline = Deadline(remaining)
+    left, slowest = remaining() if remaining else 0.0, 0.0
     state = _start(executed, config, warm)
     plan_value = evaluator.at(carry)
     walk = optimiser.random_walk if isinstance(optimiser, FastRandomWalk) else random_walk
@@ -155,8 +133,11 @@ def make_plan[C](
         values = plan_value(actions, generator) - action_costs(start, actions, config)
         values = values.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         state = optimiser.update(state, deltas, values)
-        if not deadline.allows_iteration():
-            break
+        if remaining:
+            before, left = left, remaining()
+            slowest = max(slowest, before - left)
+            if left <= slowest:
+                break
     best = walk(start, state.elites, config.eta)
     chosen = walk(start, state.mean[:, None], config.eta)[:, 0]
     return Plan(chosen, state.mean, state.value, best, state.values, iteration + 1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
 from egovcp.robot.stance import StanceController
-from egovcp.robot.walk_policy import OnnxPolicy, WalkPolicy
+from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import WalkingController
 
 STANCE: Final = "stance"
@@ -70,7 +70,7 @@ class LowLevelController(Protocol):
 
 def is_controller_file(which: str) -> bool:
     """Whether ``which`` is the path of a controller's file."""
-    return which.endswith((".safetensors", ".onnx"))
+    return which.endswith(".safetensors")
 
 
 def absolute_controller(which: str) -> str:
@@ -88,28 +88,24 @@ def load_walk_policy(which: str) -> WalkPolicy:
     if which == WALK:
         with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
             return WalkPolicy.load(path)
-    if which.endswith(".safetensors"):
+    if is_controller_file(which):
         return WalkPolicy.load(Path(os.path.expanduser(which)))
     raise UsageError(f"no trained network {which!r}; expected walk or PATH.safetensors")
 
 
 def make_controller(which: str) -> LowLevelController:
-    """The controller ``which``: ``stance`` (LQR), ``walk`` (trained, shipped), or a file.
-
-    A file is a ``walk.safetensors`` or its export to ONNX.
+    """The controller ``which``: ``stance`` (LQR), ``walk`` (trained, shipped), or the path of a
+    ``walk.safetensors``.
 
     Raises:
         UsageError: neither.
         ArtifactError: the file cannot be used.
-        EnvironmentFailure: onnxruntime is not installed.
     """
     if which == STANCE:
         return StanceController()
-    if which == WALK or which.endswith(".safetensors"):
+    if which == WALK or is_controller_file(which):
         return WalkingController(load_walk_policy(which))
-    if which.endswith(".onnx"):
-        return WalkingController(OnnxPolicy(Path(os.path.expanduser(which))))
     raise UsageError(
-        f"unknown controller {which!r}; expected stance, walk, or a file PATH.safetensors or "
-        "PATH.onnx that egovcp-train-lowlevel wrote"
+        f"unknown controller {which!r}; expected stance, walk, or a file PATH.safetensors that "
+        "egovcp-train-lowlevel wrote"
     )

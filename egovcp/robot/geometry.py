@@ -92,14 +92,14 @@ def heading_rotation(gravity: Array) -> Array:
     return out
 
 
-def focal_length(vertical_fov: float) -> float:
+def focal_length(vertical_fov: float, rows: int = DEPTH_ROWS) -> float:
     """Pixels, of a depth image with this vertical field of view (rad)."""
-    return DEPTH_ROWS / 2 / math.tan(vertical_fov / 2)
+    return rows / 2 / math.tan(vertical_fov / 2)
 
 
-def pixel_rays(focal: float) -> Array:
+def pixel_rays(focal: float, rows: int = DEPTH_ROWS, columns: int = DEPTH_COLS) -> Array:
     """Directions (H * W, 3) of all pixels of a depth image, camera frame, with x = 1."""
-    row, column = np.mgrid[:DEPTH_ROWS, :DEPTH_COLS]
-    left = -(column - (DEPTH_COLS - 1) / 2) / focal
-    up = -(row - (DEPTH_ROWS - 1) / 2) / focal
+    row, column = np.mgrid[:rows, :columns]
+    left = -(column - (columns - 1) / 2) / focal
+    up = -(row - (rows - 1) / 2) / focal
     return np.stack([np.ones(left.shape), left, up], axis=-1).reshape(-1, 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from importlib import resources
 from typing import Final
@@ -21,16 +21,6 @@ NR: Final = 2  # roll and pitch of feet that rock on their edges
 NF: Final = NX + NR + NZ  # filter: states, rocking, and a slowly changing force on each coordinate
 NU: Final = 15  # servo targets: legs 12, waist 3
 NY: Final = 36  # measurements: gravity 3, gyro 3, joint positions 15, joint rates 15
-_FIELDS: Final = (
-    "pelvis",
-    "joints",
-    "torque",
-    "pelvis_per_moment",
-    "joints_per_moment",
-    "torque_per_moment",
-    "mobility",
-    "compensator",
-)
 
 
 @dataclass(frozen=True)
@@ -45,6 +35,9 @@ class StanceRow:
     torque_per_moment: Array  # (B, 15, 2) N m per kg m
     mobility: Array  # (B, 9, 9) pelvis and waist rates per generalised impulse
     compensator: Array  # (B, 44, 80)
+
+
+_FIELDS: Final = [field.name for field in fields(StanceRow)]
 
 
 class StanceTable:

@@ -1,4 +1,4 @@
-"""The trained part of walking: a small network in a safetensors or ONNX file.
+"""The trained part of walking: a small network in a safetensors file, and its export to ONNX.
 
 A safetensors file has ``mean`` and ``std`` of the observation and ``layers.I.weight``/``.bias``;
 its metadata are the schema's version, the `WalkConfig` of the training, and the provenance
@@ -12,10 +12,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,9 +24,9 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from egovcp.bounds import check_bounds
-from egovcp.decode import decode, require_type, shown
+from egovcp.decode import decode, shown
 from egovcp.errors import ArtifactError
-from egovcp.files import parse_json, read_bytes, write_bytes
+from egovcp.files import write_bytes
 from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
@@ -42,8 +40,6 @@ _LIMIT_BYTES: Final = 64 << 20
 
 ONNX_SCHEMA: Final = "egovcp-walk-onnx-1"
 _OPSET: Final = 17
-_OPERATORS: Final = frozenset(("Sub", "Div", "Clip", "Gemm", "Elu"))
-_DIGEST: Final = re.compile("[0-9a-f]{8}")
 _INPUT, _OUTPUT = "observation", "action"
 
 #: Names of the numbers of the observation.
@@ -233,86 +229,3 @@ def _graph(policy: WalkPolicy) -> Any:
         [helper.make_tensor_value_info(_OUTPUT, TensorProto.FLOAT, ["batch", ACTIONS])],
         [numpy_helper.from_array(np.asarray(v), name) for name, v in constants.items()],
     )
-
-
-class OnnxPolicy:
-    """A `walking.Residual` that onnxruntime runs."""
-
-    def __init__(self, path: Path) -> None:
-        """Load and check a file.
-
-        Raises:
-            ArtifactError: missing, damaged, or not of this observation and action.
-            EnvironmentFailure: the package onnxruntime is missing.
-        """
-        require_packages("egovcp", "a controller in ONNX", "onnx", "onnxruntime")
-        import onnxruntime
-
-        if not os.path.lexists(path):
-            raise ArtifactError(f"{path}: no such controller; expected an exported .onnx file")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        try:
-            content = read_bytes(path, _LIMIT_BYTES)
-            _check_graph(content)
-            self._session = onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"]
-            )
-            self._metadata = self._session.get_modelmeta().custom_metadata_map
-            self.config: WalkConfig = self._check()
-        except Exception as error:  # onnx and onnxruntime raise a class per kind of damage
-            reason = " ".join(str(error).split())[:200]
-            raise ArtifactError(
-                f"{path}: not a controller of schema {ONNX_SCHEMA} ({reason})"
-            ) from error
-
-    def _check(self) -> WalkConfig:
-        if self._metadata.get("schema") != ONNX_SCHEMA:
-            raise ValueError(f"its schema is {shown(self._metadata.get('schema'))}")
-        shapes = [v.shape[1:] for v in (*self._session.get_inputs(), *self._session.get_outputs())]
-        if shapes != [[OBSERVATION_DIM], [ACTIONS]]:
-            raise ValueError(f"its shapes are {shapes}")
-        expected = {"joint_names": list(JOINT_NAMES), "observation_names": list(OBSERVATION_NAMES)}
-        for name, value in expected.items():
-            if parse_json(self._metadata[name]) != value:
-                raise ValueError(f"its {name} are others")
-        require_type(parse_json(self._metadata["provenance"]), dict[str, Any], "provenance")
-        if _DIGEST.fullmatch(self._metadata["digest"]) is None:
-            raise ValueError("its digest is not one")
-        config = decode(WalkConfig, parse_json(self._metadata["config"]), "config")
-        check_bounds(config, "config.")
-        action = self(np.zeros((1, OBSERVATION_DIM), np.float32))
-        if action.shape != (1, ACTIONS) or not np.isfinite(action).all():
-            raise ValueError("its action on an observation of zeros is not finite")
-        return config
-
-    @cached_property
-    def digest(self) -> str:
-        return str(self._metadata["digest"])
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        out: Mapping[str, Any] = json.loads(self._metadata["provenance"])
-        return out
-
-    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, 95) -> actions (B, 15)."""
-        out: NDArray[np.float32] = self._session.run([_OUTPUT], {_INPUT: observation})[0]
-        return out
-
-
-def _check_graph(content: bytes) -> None:
-    """Raise ValueError unless a model has only what `export_onnx` writes."""
-    import onnx
-
-    model = onnx.load_model_from_string(content)
-    operators = {node.op_type if not node.domain else "?" for node in model.graph.node}
-    if model.functions or not operators <= _OPERATORS:
-        raise ValueError(f"its operators are not only {', '.join(sorted(_OPERATORS))}")
-    for tensor in model.graph.initializer:
-        if tensor.data_location != onnx.TensorProto.DEFAULT:
-            raise ValueError("its weights are in another file")
-        if tensor.data_type != onnx.TensorProto.FLOAT:
-            raise ValueError("expected weights of type float32")
-        if not np.isfinite(onnx.numpy_helper.to_array(tensor)).all():
-            raise ValueError("expected finite weights")

@@ -12,7 +12,7 @@ motion (`gait`), the share of the gait g, and the action a of a policy trained b
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,9 @@ from egovcp.robot.stance import (
 )
 from egovcp.robot.stance_table import NU, stance_table
 from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
+
+if TYPE_CHECKING:
+    from egovcp.robot.walk_policy import WalkPolicy
 
 ACTIONS: Final = NU  # legs and waist
 OBSERVATION_DIM: Final = STATE_DIM + 3 + 3 + ACTIONS
@@ -179,24 +182,12 @@ class Walk:
         replace_rows(m, fresh, rows)
 
 
-class Residual(Protocol):
-    """The trained part (`walk_policy.WalkPolicy`): observations (B, 95) -> actions (B, 15)."""
-
-    @property
-    def config(self) -> WalkConfig: ...
-
-    @property
-    def digest(self) -> str: ...
-
-    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
-
-
 class WalkingController(G1Controller):
     """`LowLevelController` that stands, squats, reaches and walks."""
 
     walks = True
 
-    def __init__(self, policy: Residual) -> None:
+    def __init__(self, policy: WalkPolicy) -> None:
         self._policy = policy
         self._walk = Walk(policy.config)
         self._rows = 0

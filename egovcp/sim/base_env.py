@@ -141,19 +141,18 @@ class BaseVectorEnv(ABC):
     def controller_id(self) -> str:
         """Identity of the robot's low-level controller."""
 
-    @abstractmethod
     def _check(self, scenarios: Sequence[Scenario]) -> None:
         """Raise `UsageError` unless this environment can play the scenarios."""
+        require_robot(self.robot, [scenario.task for scenario in scenarios])
 
     @abstractmethod
     def _instance(self, scenario: Scenario) -> Any:
         """A new instance that plays a scenario."""
 
-    @abstractmethod
-    def _begin(
-        self, rows: NDArray[np.intp], controller_rows: NDArray[np.intp] | None
-    ) -> Observation:
-        """Complete the start of episodes in ``rows``; ``controller_rows`` is None for all rows."""
+    def _begin(self, rows: NDArray[np.intp] | None) -> Observation:
+        """Complete the start of episodes in ``rows``, None: in all."""
+        self._sent[slice(None) if rows is None else rows] = 0.0
+        return self._observe()
 
     @abstractmethod
     def step(self, action: NDArray[np.floating]) -> StepResult:
@@ -214,7 +213,7 @@ class BaseVectorEnv(ABC):
             self.instances = [self._instance(scenario) for scenario in scenarios]
         else:
             self._start_instances(range(self.num_envs), scenarios)
-        return self._begin(np.arange(self.num_envs), None)
+        return self._begin(None)
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
         """Start a new episode in some rows, the others stay as they are."""
@@ -224,8 +223,7 @@ class BaseVectorEnv(ABC):
             raise UsageError(f"expected {len(rows)} scenarios, found {len(scenarios)}")
         self._check(scenarios)
         self._start_instances(rows, scenarios)
-        which = np.asarray(rows, dtype=np.intp)
-        return self._begin(which, which)
+        return self._begin(np.asarray(rows, dtype=np.intp))
 
     def _start_instances(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
         for row, scenario in zip(rows, scenarios, strict=True):

@@ -29,44 +29,8 @@ _SLACK: Final = 1e-3  # pixels and metres; rounding is a billionth of it
 _CORNERS: Final = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
-class PixelGrid:
-    """Projects spheres and boxes into the image of a camera."""
-
-    def __init__(self, rows: int, columns: int, focal: float) -> None:
-        self.shape = (rows, columns)
-        self._focal = focal
-        self._last = np.array([columns - 1.0, rows - 1.0])
-        # inward normals of the planes that bound what the outermost pixels see
-        wide, high = self._last / 2 / focal
-        planes = np.array([[wide, 1, 0], [wide, -1, 0], [high, 0, 1], [high, 0, -1]])
-        self._planes = (planes / np.linalg.norm(planes, axis=1, keepdims=True)).T.copy()
-
-    def visible(self, centre: Array, radius: Array) -> NDArray[np.intp]:
-        """Which of the spheres with centres (G, 3) (m, camera frame) may be in the image."""
-        inside = (centre @ self._planes).min(axis=1) > -radius - _SLACK
-        return np.flatnonzero(inside)
-
-    def covered(self, corners: Array) -> NDArray[np.bool_]:
-        """(H, W) the pixels in which boxes with ``corners`` (G, 8, 3) (m, camera frame) can be."""
-        covered = np.zeros(self.shape, dtype=np.bool_)
-        ahead = corners[..., :1]
-        where = self._last / 2 - self._focal * corners[..., 1:] / np.maximum(ahead, _SLACK)
-        low = np.ceil(np.maximum(where.min(axis=1), 0.0) - _SLACK)
-        high = np.floor(np.minimum(where.max(axis=1), self._last) + _SLACK) + 1.0
-        # a box that reaches behind the camera has no bounded projection
-        bounded = ahead.min(axis=(1, 2)) > _SLACK
-        for i, ((left, top), (right, bottom)) in enumerate(
-            zip(low.astype(int).tolist(), high.astype(int).tolist(), strict=True)
-        ):
-            if not bounded[i]:
-                covered[:] = True
-            elif right > left and bottom > top:
-                covered[top:bottom, left:right] = True
-        return covered
-
-
 class RayCaster:
-    """Ranges from a camera on a body of ``model`` to its geoms, whose shapes are read once.
+    """The geoms of ``model`` that a camera on one of its bodies sees; their shapes are read once.
 
     Args:
         model: geoms of groups 0 and 3 are visible.
@@ -77,54 +41,15 @@ class RayCaster:
         self.model, self.body = model, body
         seen = _GROUPS.astype(np.bool_)[model.geom_group] & (model.geom_bodyid != body)
         plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        self._floor = _level_floor(model, np.flatnonzero(seen & plane))
-        self._solid = np.flatnonzero(seen & ~plane)
-        self._radius = model.geom_rbound[self._solid].copy()
-        box = model.geom_aabb[self._solid, None]
-        self._corners = box[..., :3] + _CORNERS * box[..., 3:]
+        self.floor = _level_floor(model, np.flatnonzero(seen & plane))
+        self.solid = np.flatnonzero(seen & ~plane)  # (G,) ids of the geoms besides the floor
+        self.radius = model.geom_rbound[self.solid].copy()  # (G,) m
+        box = model.geom_aabb[self.solid, None]
+        self.corners = box[..., :3] + _CORNERS * box[..., 3:]  # (G, 8, 3) m, geom frame
 
-    def ranges(
-        self,
-        data: mujoco.MjData,
-        grid: PixelGrid,
-        origin: Array,
-        rotation: Array,
-        rays: Array,
-        cutoff: float,
-    ) -> Array:
-        """Range (H * W,) m to the first visible surface; negative or beyond ``cutoff``: none.
-
-        Args:
-            data: with current geom poses.
-            origin: (3,) of all rays, m, world.
-            rotation: (3, 3) from the camera frame to the world.
-            rays: (H * W, 3) unit directions, world.
-            cutoff: m; ranges beyond it may be wrong.
-        """
-        if self._floor is None:
-            return self._cast(data, origin, rays, cutoff)
-        needed = self._needed(data, grid, origin, rotation)
-        if len(needed) == len(rays):
-            return self._cast(data, origin, rays, cutoff)
-        out = _floor_range(self._floor, origin, rays)
-        if len(needed):
-            out[needed] = self._cast(data, origin, rays[needed], cutoff)
-        return out
-
-    def _needed(
-        self, data: mujoco.MjData, grid: PixelGrid, origin: Array, rotation: Array
-    ) -> NDArray[np.intp]:
-        """Indices of the pixels in which more than the floor may be."""
-        centre = (data.geom_xpos[self._solid] - origin) @ rotation
-        near = grid.visible(centre, self._radius)
-        if len(near) == 0:
-            return near
-        turn = data.geom_xmat[self._solid[near]].reshape(-1, 3, 3).swapaxes(1, 2) @ rotation
-        corners = self._corners[near] @ turn + centre[near, None]
-        return np.flatnonzero(grid.covered(corners))
-
-    def _cast(self, data: mujoco.MjData, origin: Array, rays: Array, cutoff: float) -> Array:
-        """Ranges by MuJoCo alone."""
+    def cast(self, data: mujoco.MjData, origin: Array, rays: Array, cutoff: float) -> Array:
+        """Ranges (n,) m along ``rays`` (n, 3), world, by MuJoCo; negative or beyond ``cutoff``:
+        none."""
         count = len(rays)
         # fresh for each call, because threads share the camera
         geom, out = np.empty(count, dtype=np.int32), np.empty(count)
@@ -164,7 +89,11 @@ class RayCastCamera:
         self._axial = 1.0 / np.linalg.norm(rays, axis=1)  # cosine to the optical axis
         self._directions = rays * self._axial[:, None]
         self._cutoff = DEPTH_MAX_M / float(self._axial.min())
-        self._grid = PixelGrid(DEPTH_ROWS, DEPTH_COLS, self.focal)
+        self._last = np.array([DEPTH_COLS - 1.0, DEPTH_ROWS - 1.0])
+        # inward normals of the planes that bound what the outermost pixels see
+        wide, high = self._last / 2 / self.focal
+        planes = np.array([[wide, 1, 0], [wide, -1, 0], [high, 0, 1], [high, 0, -1]])
+        self._planes = (planes / np.linalg.norm(planes, axis=1, keepdims=True)).T.copy()
 
     def pose(
         self, data: mujoco.MjData, torso_body: int, pitch: float
@@ -185,9 +114,41 @@ class RayCastCamera:
         """
         origin, rotation = self.pose(data, caster.body, pitch)
         rays = self._directions @ np.ascontiguousarray(rotation.T)
-        ranges = caster.ranges(data, self._grid, origin, rotation, rays, self._cutoff)
+        if caster.floor is None:
+            ranges = caster.cast(data, origin, rays, self._cutoff)
+        else:
+            ranges = _floor_range(caster.floor, origin, rays)
+            needed = self._covered(caster, data, origin, rotation)
+            if len(needed):
+                ranges[needed] = caster.cast(data, origin, rays[needed], self._cutoff)
         ranges *= self._axial
         return within_range(ranges.astype(np.float32)).reshape(DEPTH_ROWS, DEPTH_COLS)
+
+    def _covered(
+        self, caster: RayCaster, data: mujoco.MjData, origin: Array, rotation: Array
+    ) -> NDArray[np.intp]:
+        """Indices of the pixels in which more than the floor may be."""
+        centre = (data.geom_xpos[caster.solid] - origin) @ rotation
+        near = np.flatnonzero((centre @ self._planes).min(axis=1) > -caster.radius - _SLACK)
+        if len(near) == 0:
+            return near
+        turn = data.geom_xmat[caster.solid[near]].reshape(-1, 3, 3).swapaxes(1, 2) @ rotation
+        corners = caster.corners[near] @ turn + centre[near, None]  # (G, 8, 3) m, camera frame
+        covered = np.zeros((DEPTH_ROWS, DEPTH_COLS), dtype=np.bool_)
+        ahead = corners[..., :1]
+        where = self._last / 2 - self.focal * corners[..., 1:] / np.maximum(ahead, _SLACK)
+        low = np.ceil(np.maximum(where.min(axis=1), 0.0) - _SLACK)
+        high = np.floor(np.minimum(where.max(axis=1), self._last) + _SLACK) + 1.0
+        # a box that reaches behind the camera has no bounded projection
+        bounded = ahead.min(axis=(1, 2)) > _SLACK
+        for i, ((left, top), (right, bottom)) in enumerate(
+            zip(low.astype(int).tolist(), high.astype(int).tolist(), strict=True)
+        ):
+            if not bounded[i]:
+                covered[:] = True
+            elif right > left and bottom > top:
+                covered[top:bottom, left:right] = True
+        return np.flatnonzero(covered)
 
 
 def within_range(depth: NDArray[np.float32]) -> NDArray[np.float32]:

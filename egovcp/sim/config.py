@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, is_dataclass, make_dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds, check_ranges
 from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range
@@ -20,16 +20,6 @@ from egovcp.sim.tasks.registry import find_task, task_entries
 from egovcp.spec import ACTION_RATE_COST, POSE_COST
 
 _ROBOT_BYTES: Final = 900_000  # MuJoCo state of one robot and its scene, measured
-
-
-def _check_ranges(where: str, part: object) -> None:
-    """Refuse a (low, high) pair that is the wrong way round."""
-    for name, value in vars(part).items():
-        match value:
-            case (int() | float() as low, int() | float() as high) if low > high:
-                raise UsageError(
-                    f"expected low <= high, found {low} > {high} in env.{where}.{name}"
-                )
 
 
 @dataclass(frozen=True)
@@ -109,7 +99,7 @@ class BaseEnvConfig:
     largest change."""
     controller: str = "walk"
     """Low-level controller: walk (trained, ships with the package), stance (LQR, does not step, for
-    ball and wall only), or the walk.safetensors or walk.onnx of egovcp-train-lowlevel."""
+    ball and wall only), or the walk.safetensors of egovcp-train-lowlevel."""
     feet: Literal["stock", "points"] = "points"
     """Foot collision model: four points each (about twice as fast), or the stock capsules."""
     camera: CameraConfig = CameraConfig()
@@ -127,7 +117,7 @@ class BaseEnvConfig:
         check_bounds(self)
         for name, part in vars(self).items():
             if is_dataclass(part):
-                _check_ranges(name, part)
+                check_ranges(f"env.{name}", part)
         for task in _tasks():
             task.check_options(self)
 

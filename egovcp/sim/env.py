@@ -12,17 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController, absolute_controller, make_controller
 from egovcp.robot_spec import G1
-from egovcp.sim.base_env import BaseVectorEnv, Observation, StepResult, one_robot, require_robot
+from egovcp.sim.base_env import BaseVectorEnv, Observation, StepResult, one_robot
 from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks.base import Solid
 from egovcp.spec import (
     ACTION_BOX,
     COMMAND_SLICE,
@@ -31,6 +29,7 @@ from egovcp.spec import (
     DEPTH_MAX_M,
     DEPTH_ROWS,
     STATE_DIM,
+    Solid,
 )
 
 if TYPE_CHECKING:
@@ -46,29 +45,18 @@ class PrivilegedState:
     ``_w``: world, ``_b``: pelvis heading frame.
     """
 
-    task: tuple[str, ...]  # (B,) the current task; in a sequence it changes
-    time: Array  # (B,) s since the start of the episode
     since_event: Array
     """(B,) s since the event of the task; negative before, -inf if there is none."""
     pelvis_w: Array  # (B, 7) position m, quaternion wxyz
     pelvis_velocity_w: Array  # (B, 3) m/s
-    joint_position: Array  # (B, J) rad, without sensor noise
-    joint_velocity: Array  # (B, J) rad/s, without sensor noise
     hands_b: Array  # (B, 2, 3) palm sites, m
     object_w: Array  # (B, 3) position of the task's object, m; NaN: there is none
     object_b: Array  # (B, 3) the same, m
     object_velocity_w: Array  # (B, 3) m/s
-    object_velocity_b: Array
-    """(B, 3) in the axes of the heading frame, not relative to the pelvis, m/s."""
-    object_size: Array  # (B,) such as a radius, m; NaN: there is none
     object_active: NDArray[np.bool_]  # (B,) the robot has to act now
     contact_force: Array
     """(B, parts) peak force between each of ``scene.PARTS`` and the object in the last
     planner tick, N."""
-    body_position_w: Array  # (B, N, 3) robot bodies in the order of ``body_names``, m
-    body_quaternion_w: Array  # (B, N, 4) wxyz
-    body_names: tuple[str, ...]  # Names of the N robot bodies, as in the MJCF
-    camera_w: Array  # (B, 7) position m, quaternion wxyz; x is the optical axis, y left, z up
     solids: tuple[tuple[Solid, ...], ...]  # Per row, the objects in the scene
 
 
@@ -76,42 +64,22 @@ def privileged_state(instances: Sequence[EnvInstance]) -> PrivilegedState:
     """The state of all rows."""
     states = [i.task.state() for i in instances]
     datas = [i.robot.data for i in instances]
-    index = instances[0].robot.index
     position = np.array([state.position_w for state in states])
-    velocity = np.array([state.velocity_w for state in states])
     hands = np.array([i.robot.palms_w for i in instances])
     heading = np.array([i.robot.heading for i in instances])
     pelvis = np.array([data.qpos[:7] for data in datas])
-    bodies = [i.robot.index.robot_bodies for i in instances]
     return PrivilegedState(
-        task=tuple(i.task.current_name for i in instances),
-        time=np.array([i.task.time for i in instances]),
         since_event=np.array([i.task.since_event for i in instances]),
         pelvis_w=pelvis,
         pelvis_velocity_w=np.array([data.qvel[:3] for data in datas]),
-        joint_position=np.array([d.qpos[index.joint_qpos] for d in datas]),
-        joint_velocity=np.array([d.qvel[index.joint_qvel] for d in datas]),
         hands_b=np.einsum("bhi,bij->bhj", hands - pelvis[:, None, :3], heading),
         object_w=position,
         object_b=np.einsum("bi,bij->bj", position - pelvis[:, :3], heading),
-        object_velocity_w=velocity,
-        object_velocity_b=np.einsum("bi,bij->bj", velocity, heading),
-        object_size=np.array([state.size for state in states]),
+        object_velocity_w=np.array([state.velocity_w for state in states]),
         object_active=np.array([state.active for state in states]),
         contact_force=np.array([i.task.forces for i in instances]),
-        body_position_w=np.array([d.xpos[b] for d, b in zip(datas, bodies, strict=True)]),
-        body_quaternion_w=np.array([d.xquat[b] for d, b in zip(datas, bodies, strict=True)]),
-        body_names=index.body_names,
-        camera_w=np.array([_camera_pose(i) for i in instances]),
         solids=tuple(i.task.solids() for i in instances),
     )
-
-
-def _camera_pose(instance: EnvInstance) -> Array:
-    position, rotation = instance.camera_pose
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    return np.concatenate([position, quaternion])
 
 
 def resolve_config(config: EnvConfig, tasks: Iterable[str] = ()) -> EnvConfig:
@@ -163,20 +131,18 @@ class VectorEnv(BaseVectorEnv):
         return self.controller.id
 
     def _check(self, scenarios: Sequence[Scenario]) -> None:
-        require_robot(self.robot, [scenario.task for scenario in scenarios])
+        super()._check(scenarios)
         for scenario in scenarios:
             self.config.require_walking(scenario.task, self.controller.walks)
 
     def _instance(self, scenario: Scenario) -> EnvInstance:
         return EnvInstance(self.config, self._camera, self._standing, scenario, self._render_depth)
 
-    def _begin(
-        self, rows: NDArray[np.intp], controller_rows: NDArray[np.intp] | None
-    ) -> Observation:
-        self._sent[rows] = 0.0
+    def _begin(self, rows: NDArray[np.intp] | None) -> Observation:
+        observation = super()._begin(rows)
         self._measure(self._sent[:, 0])
-        self.controller.reset(self._controller_state, controller_rows)
-        return self._observe()
+        self.controller.reset(self._controller_state, rows)
+        return observation
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, 7) per row and let a planner tick (40 ms) pass."""

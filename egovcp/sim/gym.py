@@ -8,10 +8,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.controllers import LowLevelController
 from egovcp.sim import config as sim_config
 from egovcp.sim.base_env import Observation
-from egovcp.sim.env import VectorEnv
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
@@ -31,20 +29,12 @@ class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
 
-    def __init__(
-        self,
-        task: str,
-        config: sim_config.EnvConfig | None = None,
-        controller: LowLevelController | None = None,
-        seed: int = 0,
-    ) -> None:
-        self._next = Scenario(task, seed, 0)
+    def __init__(self, task: str, config: sim_config.EnvConfig | None = None) -> None:
+        self._next = Scenario(task, 0, 0)
         options = config or sim_config.EnvConfig()
         robot = find_task(task).robot_spec()
         self.metadata = {"render_modes": [], "render_fps": robot.planner_hz}
-        self._env = (
-            VectorEnv(options, 1, controller) if robot.is_g1 else make_env(options, 1, [task])
-        )
+        self._env = make_env(options, 1, [task])
         most = round(1000 * robot.depth_max_m)
         self.observation_space = gymnasium.spaces.Dict(
             {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
@@ -42,42 +42,32 @@ Array = NDArray[np.float64]
 _NO_IMAGE: Final = np.zeros((DEPTH_ROWS, DEPTH_COLS), dtype=np.uint16)
 _SETTLE_TICKS: Final = 100  # controller ticks, 2 s
 _NOISELESS: Final = SensorConfig(0.0, 0.0, 0.0, 0.0)
+#: Ranges in `RandomisationConfig`; their order is part of what is sampled.
+_PHYSICS: Final = ("friction", "payload", "mass_scale", "stiffness_scale", "damping_scale")
 
 
-@dataclass(frozen=True)
-class PhysicsParameters:
-    """The randomised physical parameters of one episode."""
-
-    friction: float  # Sliding friction of the feet
-    payload: float  # kg on the torso
-    mass_scale: float  # Factor on every mass of the robot
-    stiffness_scale: float  # Factor on the servo stiffness
-    damping_scale: float  # Factor on the servo damping
-
-
-def sample_physics(config: RandomisationConfig, scenario: Scenario) -> PhysicsParameters:
-    """Sample the parameters of ``scenario``."""
+def sample_physics(config: RandomisationConfig, scenario: Scenario) -> dict[str, float]:
+    """The physical parameters of ``scenario``, each uniform in the range of that name."""
     rng = scenario.rng("physics")
-    names = (f.name for f in fields(PhysicsParameters))  # their order is part of what is sampled
-    return PhysicsParameters(*(float(rng.uniform(*getattr(config, name))) for name in names))
+    return {name: float(rng.uniform(*getattr(config, name))) for name in _PHYSICS}
 
 
-def apply_physics(physics: PhysicsParameters, scene: Scene, model: mujoco.MjModel) -> None:
+def apply_physics(physics: dict[str, float], scene: Scene, model: mujoco.MjModel) -> None:
     """Write ``physics`` into ``model``, starting from the pristine values of ``scene``."""
     pristine, index = scene.model, scene.index
-    model.geom_friction[index.foot_geoms, 0] = physics.friction
+    model.geom_friction[index.foot_geoms, 0] = physics["friction"]
     bodies, torso = index.robot_bodies, index.torso_body
     mass, inertia = pristine.body_mass[bodies], pristine.body_inertia[bodies]
-    model.body_mass[bodies] = mass * physics.mass_scale
-    model.body_inertia[bodies] = inertia * physics.mass_scale
-    loaded = (model.body_mass[torso] + physics.payload) / model.body_mass[torso]
+    model.body_mass[bodies] = mass * physics["mass_scale"]
+    model.body_inertia[bodies] = inertia * physics["mass_scale"]
+    loaded = (model.body_mass[torso] + physics["payload"]) / model.body_mass[torso]
     model.body_mass[torso] *= loaded
     model.body_inertia[torso] *= loaded
     # torque = gain * target + bias . (1, q, q'), so kp is in both and kd in the bias
     gain, bias = pristine.actuator_gainprm, pristine.actuator_biasprm
-    model.actuator_gainprm[:, 0] = gain[:, 0] * physics.stiffness_scale
-    model.actuator_biasprm[:, 1] = bias[:, 1] * physics.stiffness_scale
-    model.actuator_biasprm[:, 2] = bias[:, 2] * physics.damping_scale
+    model.actuator_gainprm[:, 0] = gain[:, 0] * physics["stiffness_scale"]
+    model.actuator_biasprm[:, 1] = bias[:, 1] * physics["stiffness_scale"]
+    model.actuator_biasprm[:, 2] = bias[:, 2] * physics["damping_scale"]
 
 
 def initial_offset(config: RandomisationConfig, scenario: Scenario) -> NDArray[np.float64]:
@@ -156,7 +146,6 @@ class EnvInstance(BaseInstance):
         apply_physics(self.physics, self.robot.scene, self.robot.model)
         task: Any = find_task(scenario.task)(self._config, scenario, self.robot)
         self.task: Task = task
-        self._task_parameters = self.task.parameters
         self._caster = RayCaster(self.robot.model, self.robot.index.torso_body)
         offset = initial_offset(self._config.randomise, scenario)
         self.robot.reset(replace(self._standing, joints=self._standing.joints + offset))
@@ -189,15 +178,10 @@ class EnvInstance(BaseInstance):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The sampled parameters of this episode; SI units, delays in controller ticks.
-
-        ``event_tick`` is -1 in an episode without an event.
-        """
-        event = self.task.event_tick
+        """As `BaseInstance.parameters`; SI units, delays in controller ticks."""
         return {
-            **asdict(self.physics),
-            **self._task_parameters,
-            "event_tick": -1 if event is None else event,
+            **self.physics,
+            **super().parameters,
             "action_delay_ticks": self.action_delay,
             "image_age_ticks": self.image_age,
             "camera_pitch": self.camera_pitch,
@@ -211,7 +195,7 @@ class EnvInstance(BaseInstance):
             "action_delay": self.action_delay,
             "image_age": self.image_age,
             "camera_pitch": self.camera_pitch,
-            "physics": asdict(self.physics),
+            "physics": self.physics,
             "scene": self.task.parameters,
         }
 
@@ -231,12 +215,6 @@ class EnvInstance(BaseInstance):
     def depth(self) -> NDArray[np.uint16]:
         """(H, W) mm: the image in the observation of this planner tick."""
         return self._images[-1 - self.image_age // CONTROLLER_TICKS_PER_PLAN]
-
-    @property
-    def camera_pose(self) -> tuple[Array, Array]:
-        """Position (3,) and rotation (3, 3) of the camera now, world; x is the optical axis."""
-        robot = self.robot
-        return self._camera.pose(robot.data, robot.index.torso_body, self.camera_pitch)
 
     def advance(self, target: Array) -> None:
         """One controller tick: physics under the joint targets (J,), then the sensors."""
@@ -265,7 +243,7 @@ class EnvInstance(BaseInstance):
         if not self.robot.diverged:
             return
         scenario = self.scenario
-        scene = ", ".join(f"{name}={value:.3g}" for name, value in self._task_parameters.items())
+        scene = ", ".join(f"{name}={value:.3g}" for name, value in self.task.parameters.items())
         error = SimulationDiverged(
             f"the simulation diverged in task {scenario.task}, seed {scenario.seed}, episode "
             f"{scenario.episode}, after {self.task.time:.2f} s: {self.robot.divergence}; the scene "

@@ -176,8 +176,8 @@ class LiveRobot:
     def drive(self, command: ServoCommand) -> None:
         """Set the motor command until the next call; effort limits apply."""
         model, physics = self.robot.model, self.instance.physics
-        stiffness = command.stiffness * physics.stiffness_scale
-        damping = command.damping * physics.damping_scale
+        stiffness = command.stiffness * physics["stiffness_scale"]
+        damping = command.damping * physics["damping_scale"]
         model.actuator_gainprm[:, 0] = 1.0
         model.actuator_biasprm[:, 1] = -stiffness
         model.actuator_biasprm[:, 2] = -damping

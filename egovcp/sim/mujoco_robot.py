@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.robot.geometry import focal_length, pixel_rays
 from egovcp.robot_spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -57,7 +58,11 @@ class MujocoRobot(ABC):
         self.rng = np.random.default_rng(0)
         """Source of sensor noise in this episode."""
         self._camera = int(model.camera(self.camera).id)
-        self._rays = camera_rays(float(model.cam_fovy[self._camera]), self.spec.depth)
+        rows, columns = self.spec.depth
+        focal = focal_length(math.radians(float(model.cam_fovy[self._camera])), rows)
+        forward, left, up = pixel_rays(focal, rows, columns).T
+        rays = np.stack([-left, up, -forward], axis=-1)  # MuJoCo's axes: x right, y up, -z forward
+        self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     # --- the robot -----------------------------------------------------------------------
     @classmethod
@@ -133,19 +138,3 @@ class MujocoRobot(ABC):
     def diverged(self) -> bool:
         """Whether the physics is no longer valid."""
         return any(self.data.warning[kind].number for kind in _WARNINGS)
-
-
-def camera_rays(fovy: float, shape: tuple[int, int]) -> Array:
-    """(H * W, 3) unit vectors through the pixel centres, camera frame (x right, y up, -z forward).
-
-    Args:
-        fovy: angle between top and bottom edge of the image, degrees.
-        shape: rows and columns of the image; pixels are square.
-    """
-    rows, cols = shape
-    focal = rows / 2 / math.tan(math.radians(fovy) / 2)
-    x = (np.arange(cols) + 0.5 - cols / 2) / focal
-    y = -(np.arange(rows) + 0.5 - rows / 2) / focal
-    rays = np.stack([*np.meshgrid(x, y), -np.ones((rows, cols))], -1).reshape(-1, 3)
-    unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return unit

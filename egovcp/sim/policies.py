@@ -6,8 +6,9 @@ to all of them; only oracles read the simulator's privileged state.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,33 +22,25 @@ from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
 Array = NDArray[np.float64]
 
 
-class EnvPolicy(Protocol):
-    """Acts on all rows of an environment."""
+class EnvPolicy(ABC):
+    """Acts on all rows of an environment; by default without memory."""
 
-    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
+    def reset(  # noqa: B027 - optional
+        self, env: BaseVectorEnv, scenarios: Sequence[Scenario]
+    ) -> None:
         """Each row starts one of ``scenarios``."""
-        ...
 
-    def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
+    def reset_rows(  # noqa: B027 - optional
+        self, rows: Sequence[int], scenarios: Sequence[Scenario]
+    ) -> None:
         """``rows`` start ``scenarios``."""
-        ...
 
+    @abstractmethod
     def act(self, env: BaseVectorEnv) -> Array:
         """(B, A) normalised actions for this planner tick."""
-        ...
 
 
-class _Stateless:
-    """A policy without memory."""
-
-    def reset(self, env: BaseVectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """See `EnvPolicy`."""
-
-    def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
-        """See `EnvPolicy`."""
-
-
-class Constant(_Stateless):
+class Constant(EnvPolicy):
     """The same action always."""
 
     def __init__(
@@ -61,14 +54,14 @@ class Constant(_Stateless):
         return np.tile(self._action, (env.num_envs, 1))
 
 
-class Hold(_Stateless):
+class Hold(EnvPolicy):
     """The neutral pose."""
 
     def act(self, env: BaseVectorEnv) -> Array:
         return np.zeros((env.num_envs, env.robot.action_dim))
 
 
-class RandomWalk:
+class RandomWalk(EnvPolicy):
     """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^7.
 
     The defaults are the paper's (section III-B).
@@ -147,7 +140,7 @@ class RandomWalk:
         return rng.uniform(-1.0, 1.0, self._action.shape[1])
 
 
-class Oracle(_Stateless):
+class Oracle(EnvPolicy):
     """The scripted solution of the current task of every row, `Task.oracle`.
 
     Raises:

@@ -140,7 +140,9 @@ class SimulatedRobot:
     @property
     def rotation(self) -> Array:
         """(3, 3) from the pelvis frame to the world."""
-        return base_rotation(self.data.qpos[3:7])
+        out = np.empty(9)
+        mujoco.mju_quat2Mat(out, self.data.qpos[3:7])
+        return out.reshape(3, 3)
 
     @property
     def tilt(self) -> float:
@@ -167,13 +169,6 @@ class SimulatedRobot:
         geoms = self.data.contact.geom
         touching = geoms[(geoms == self.index.floor).any(axis=1)]
         return bool(np.isin(self.index.part[touching], (TORSO, HEAD)).any())
-
-
-def base_rotation(quaternion: Array) -> Array:
-    """Unit quaternion wxyz (4,) -> rotation (3, 3) from the pelvis frame to the world."""
-    out = np.empty(9)
-    mujoco.mju_quat2Mat(out, quaternion)
-    return out.reshape(3, 3)
 
 
 def noise_std(config: SensorConfig) -> Array:

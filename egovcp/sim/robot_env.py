@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,17 +133,8 @@ class RobotEnv(BaseVectorEnv):
         """`MujocoRobot.control_id`."""
         return self._class.control_id
 
-    def _check(self, scenarios: Sequence[Scenario]) -> None:
-        one_robot([scenario.task for scenario in scenarios])
-
     def _instance(self, scenario: Scenario) -> RobotInstance:
         return RobotInstance(self.config, scenario, self._render_depth)
-
-    def _begin(
-        self, rows: NDArray[np.intp], controller_rows: NDArray[np.intp] | None
-    ) -> Observation:
-        self._sent[rows] = 0.0
-        return self._observe()
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, A) per row and let a planner tick pass."""

@@ -74,9 +74,7 @@ class SceneIndex:
     objects: Mapping[str, tuple[int, ...]]  # Task -> geom ids of its objects
     floor: int  # Geom id of the floor
     foot_geoms: NDArray[np.intp]  # Geom ids of the feet
-    robot_bodies: NDArray[np.intp]
-    """Body ids of the robot: the pelvis first, in the order of ``body_names``."""
-    body_names: tuple[str, ...]  # Names of ``robot_bodies``
+    robot_bodies: NDArray[np.intp]  # Body ids of the robot, the pelvis first
     torso_body: int  # Body id of the torso, which carries the camera
     palm_sites: NDArray[np.intp]  # (2,) site ids of the left and the right palm
     joint_qpos: slice  # Joint positions in ``qpos``, ``JOINT_NAMES`` order
@@ -141,7 +139,6 @@ def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex
     names = [model.geom(i).name for i in range(model.ngeom)]
     owner = {model.body(body).id: task for task, own in objects.items() for body in own}
     object_bodies = list(owner)
-    bodies = [i for i in range(1, model.nbody) if i not in object_bodies]
     first = model.joint(JOINT_NAMES[0])
     qpos, qvel = int(first.qposadr[0]), int(first.dofadr[0])
     return SceneIndex(
@@ -155,8 +152,7 @@ def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex
         },
         floor=model.geom(FLOOR).id,
         foot_geoms=np.array([i for i, name in enumerate(names) if "_foot" in name]),
-        robot_bodies=np.array(bodies),
-        body_names=tuple(model.body(i).name for i in bodies),
+        robot_bodies=np.setdiff1d(np.arange(1, model.nbody), object_bodies),
         torso_body=model.body("torso_link").id,
         palm_sites=np.array([model.site(f"{side}_palm").id for side in ("left", "right")]),
         joint_qpos=slice(qpos, qpos + len(JOINT_NAMES)),

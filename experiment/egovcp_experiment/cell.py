@@ -82,8 +82,6 @@ class CellCommand:
     """Name of the command in reports; empty: ``python -m MODULE``."""
     packages: tuple[str, ...] = ()
     """Optional modules that it imports."""
-    uses_gpu: bool = False
-    """Whether it trains networks and needs a GPU on a cluster."""
     exclusive: bool = False
     """Whether it measures time, so that no other cell may run at the same time."""
 
@@ -237,7 +235,6 @@ TRAIN: Final = CellCommand(
     digest=lambda folder: _artifact_digest(folder / ARTIFACT),
     resume_flags=_resume_from_checkpoint,
     prog="egovcp-train",
-    uses_gpu=True,
 )
 TRAIN_PPO: Final = CellCommand(
     module="egovcp_train.ppo.train",
@@ -247,7 +244,6 @@ TRAIN_PPO: Final = CellCommand(
     resume_flags=_resume_from_checkpoint,
     prog="egovcp-train-ppo",
     packages=("rsl_rl", "tensordict"),
-    uses_gpu=True,
 )
 PLAY: Final = CellCommand(
     module="egovcp_deploy.evaluate",

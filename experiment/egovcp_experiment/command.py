@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,8 +19,6 @@ from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
 from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.local_runner import LocalRunner
-from egovcp_experiment.ray_runner import RayRunner
 from egovcp_experiment.report import publish
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
@@ -60,12 +58,11 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
     experiment = EXPERIMENTS[name]
     cells = experiment.cells(config)
     store = CellStore(Path(config.output_dir))
-    with store.locked(), closing(_runner(config)) as runner:
-        scheduler = CellScheduler(cells, store, config.jobs, echo, runner)
+    with store.locked():
+        scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records
-        if config.backend == "local":
-            for command in dict.fromkeys(c.command for c in cells if c.name not in records):
-                require_packages("egovcp-experiment", command.shell_name, *command.packages)
+        for command in dict.fromkeys(c.command for c in cells if c.name not in records):
+            require_packages("egovcp-experiment", command.shell_name, *command.packages)
         echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete")
         try:
             scheduler.run()
@@ -110,10 +107,6 @@ def _naming(option: str) -> Iterator[None]:
         raise type(error)(f"{option}: {error}") from error
 
 
-def _runner(config: ExperimentConfig) -> RayRunner | LocalRunner:
-    return RayRunner(config.ray, echo) if config.backend == "ray" else LocalRunner(config.jobs)
-
-
 COMMANDS: Final = CommandGroup(
     "egovcp-experiment",
     "Run one of the paper's experiments, cell by cell, and write its report.",
@@ -129,6 +122,3 @@ COMMANDS: Final = CommandGroup(
     noun="experiment",
 )
 main = COMMANDS.main
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -128,17 +128,6 @@ class PpoBaselineConfig:
 
 
 @dataclass(frozen=True)
-class RayConfig:
-    """Resources of a cell on a Ray cluster."""
-
-    cpus: float = bounded(1.0, above=0)
-    """CPU cores reserved per cell. Ray does not limit commands to them: set their processes and
-    threads with '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
-    gpus: float = bounded(0.0, least=0)
-    """GPUs reserved per training; other cells use none."""
-
-
-@dataclass(frozen=True)
 class ExperimentConfig:
     """Run one of the paper's experiments, cell by cell, and write its report.
 
@@ -151,13 +140,8 @@ class ExperimentConfig:
     """Folder of cells and reports; experiments with the same options can share it."""
     scale: Scale = "small"
     """smoke: minutes, figures without meaning; small: hours on two cores; paper: the paper's."""
-    backend: Literal["local", "ray"] = "local"
-    """Where cells run: local: on this machine; ray: on the Ray cluster of RAY_ADDRESS, whose nodes
-    must all have --output_dir under the same path."""
     jobs: int = bounded(1, least=1, most=1024)
-    """Cells that run at the same time; on this machine each on its share of the CPU cores."""
-    ray: RayConfig = field(default_factory=RayConfig)
-    """Resources of a cell on a Ray cluster."""
+    """Cells that run at the same time, each on its share of the CPU cores."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
@@ -180,8 +164,7 @@ class ExperimentConfig:
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
         check_bounds(self, "--")
-        if self.backend == "local":
-            require_cores("--jobs", self.jobs)
+        require_cores("--jobs", self.jobs)
         for option, given, known in (
             ("tasks", self.tasks, TASKS),
             ("data.roots", self.data.roots, TASKS),

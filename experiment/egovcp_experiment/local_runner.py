@@ -14,9 +14,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -26,17 +25,6 @@ if TYPE_CHECKING:  # not imported in the processes of cells
     from egovcp_experiment.cell import CellCommand
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
-
-
-@dataclass(frozen=True)
-class CellExit:
-    """A command that has ended."""
-
-    code: int
-    machine: Mapping[str, Any] = field(default_factory=dict)
-    """Hardware that it ran on."""
-    error: str = ""
-    """Why it could not run; empty: see its log."""
 
 
 def versions() -> dict[str, str]:
@@ -55,9 +43,7 @@ def machine() -> dict[str, Any]:
 class LocalProcess:
     """A command in a process, which is interrupted when this process ends."""
 
-    def __init__(
-        self, module: str, argv: Sequence[str], log: Path, folder: str | None = None
-    ) -> None:
+    def __init__(self, module: str, argv: Sequence[str], log: Path) -> None:
         with log.open("ab") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "egovcp_experiment.local_runner", module, *argv],
@@ -66,7 +52,6 @@ class LocalProcess:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # the scheduler handles Ctrl-C
                 env=os.environ | {"PYTHONUNBUFFERED": "1"},
-                cwd=folder,
             )
 
     @property
@@ -74,19 +59,13 @@ class LocalProcess:
         """Process and process group."""
         return self._process.pid
 
-    def ended(self) -> CellExit | None:
-        """How it ended, or None."""
+    def ended(self) -> int | None:
+        """Its exit code, or None."""
         code = self._process.poll()
         if code is None:
             return None
         self.interrupt()  # closes the pipe
-        return CellExit(code, machine())
-
-    def wait(self, seconds: float) -> CellExit | None:
-        """`ended` after at most this time."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(seconds)
-        return self.ended()
+        return code
 
     def interrupt(self) -> None:
         """Close its standard input, which interrupts it."""
@@ -117,9 +96,6 @@ class LocalRunner:
                 os.sched_setaffinity(process.pid, cores[slot::jobs] or cores)
         return process
 
-    def close(self) -> None:
-        """Does nothing."""
-
 
 def _interrupt_at_end_of_input() -> None:
     while os.read(0, 1):
@@ -131,7 +107,6 @@ def main() -> int:
     """Entry point of a cell's process; returns the exit code of the command."""
     module, *argv = sys.argv[1:]
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # Ray's workers block it
     threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
     sys.argv = [module, *argv]
     try:

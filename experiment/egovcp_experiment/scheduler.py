@@ -12,8 +12,7 @@ from typing import Final
 from egovcp.errors import EnvironmentFailure
 from egovcp.workers import stop_on_signal
 from egovcp_experiment.cell import Cell, Record, in_order
-from egovcp_experiment.local_runner import INTERRUPTED, LocalProcess, LocalRunner
-from egovcp_experiment.ray_runner import RayRun, RayRunner
+from egovcp_experiment.local_runner import INTERRUPTED, LocalProcess, LocalRunner, machine
 from egovcp_experiment.store import CellStore
 
 _POLL_S: Final = 0.05
@@ -25,7 +24,7 @@ class _Running:
 
     cell: Cell
     argv: list[str]
-    run: LocalProcess | RayRun
+    run: LocalProcess
     start: float
 
 
@@ -35,7 +34,6 @@ class CellScheduler:
     Args:
         cells: each after those it needs.
         log: called with each line of progress.
-        runner: runs the commands; None: `LocalRunner`.
 
     Raises:
         UsageError: a stored result has other settings.
@@ -47,11 +45,10 @@ class CellScheduler:
         store: CellStore,
         jobs: int = 1,
         log: Callable[[str], None] = print,
-        runner: LocalRunner | RayRunner | None = None,
     ) -> None:
         self._cells = in_order(cells)
         self._store, self._jobs, self._log = store, jobs, log
-        self._runner = runner or LocalRunner(jobs)
+        self._runner = LocalRunner(jobs)
         self.records: dict[str, Record] = {}
         self.failed: dict[str, str] = {}
         self._running: list[_Running] = []
@@ -119,22 +116,22 @@ class CellScheduler:
     def _collect(self) -> None:
         """Store the results of commands that have ended."""
         for running in list(self._running):
-            cell, end = running.cell, running.run.ended()
-            if end is None:
+            cell, code = running.cell, running.run.ended()
+            if code is None:
                 continue
             self._running.remove(running)
             minutes = (time.monotonic() - running.start) / 60.0
-            if end.code == 0:
+            if code == 0:
                 date = datetime.now(UTC).isoformat(timespec="seconds")
-                facts = {"minutes": minutes, "date": date, **end.machine}
+                facts = {"minutes": minutes, "date": date, **machine()}
                 record = self._store.save(cell, self.records, running.argv, facts)
                 self.records[cell.name] = record
                 self._progress(cell, f"done in {minutes:.1f} min")
-            elif end.code == INTERRUPTED and self._stopping:
+            elif code == INTERRUPTED and self._stopping:
                 self._progress(cell, f"stopped after {minutes:.1f} min")
             else:
-                message = end.error or _last_line(self._store.log(cell))
-                self.failed[cell.name] = message = message or f"exit code {end.code}"
+                message = _last_line(self._store.log(cell)) or f"exit code {code}"
+                self.failed[cell.name] = message
                 self._progress(cell, f"failed after {minutes:.1f} min: {message}")
 
     def _progress(self, cell: Cell, event: str) -> None:

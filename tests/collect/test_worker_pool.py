@@ -46,9 +46,7 @@ class _Worker:
         self.alive, self.killed = False, True
 
 
-class _Backend:
-    cores = 2
-
+class _Group:
     def __init__(self, behaviour: Behaviour) -> None:
         self._behaviour = behaviour
         self.workers: list[_Worker] = []
@@ -60,22 +58,17 @@ class _Backend:
     def wait(self, seconds: float) -> None:
         time.sleep(0.001)
 
-    def close(self) -> None:
-        pass
 
-
-def _run(
-    behaviour: Behaviour, episodes: int = 20, workers: int = 2
-) -> tuple[list[int], WorkerPool, _Backend]:
-    """Numbers of the finished episodes in order, the pool, and its backend."""
-    backend = _Backend(behaviour)
+def _run(behaviour: Behaviour, episodes: int = 20, workers: int = 2) -> tuple[list[int], _Group]:
+    """Numbers of the finished episodes in order, and the group of workers."""
+    group = _Group(behaviour)
     scenarios = [Scenario("ball", 0, i) for i in range(episodes)]
     numbers: list[int] = []
-    with closing(WorkerPool(backend, workers, scenarios, _NUM_ENVS, timeout=0.05)) as pool:
+    with closing(WorkerPool(group, workers, scenarios, _NUM_ENVS, timeout=0.05)) as pool:
         while not pool.done:
             for report in pool.poll():
                 numbers += report.finished
-    return numbers, pool, backend
+    return numbers, group
 
 
 def _once(what: Callable[[_Worker], WorkerReport | None], at: int) -> Behaviour:
@@ -106,11 +99,10 @@ def _normal(worker: _Worker, number: int) -> None:
 @pytest.mark.parametrize("episodes", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_every_episode_is_finished_once(episodes: int, workers: int) -> None:
-    numbers, pool, backend = _run(_normal, episodes, workers)
+    numbers, group = _run(_normal, episodes, workers)
     assert sorted(numbers) == list(range(episodes))
-    assert pool.replaced == 0
-    assert len(backend.workers) <= workers
-    assert all(worker.killed for worker in backend.workers)
+    assert len(group.workers) <= workers
+    assert all(worker.killed for worker in group.workers)
 
 
 @pytest.mark.parametrize("fault", [_die, _hang])
@@ -118,10 +110,9 @@ def test_every_episode_is_finished_once(episodes: int, workers: int) -> None:
 def test_a_lost_worker_is_replaced_and_its_episodes_are_repeated(
     fault: Callable[[_Worker], None], at: int
 ) -> None:
-    numbers, pool, backend = _run(_once(fault, at))
+    numbers, group = _run(_once(fault, at))
     assert sorted(numbers) == list(range(20))
-    assert pool.replaced == 1
-    assert len(backend.workers) == 3
+    assert len(group.workers) == 3
 
 
 def test_an_episode_that_kills_every_worker_raises() -> None:
@@ -144,9 +135,9 @@ def test_an_episode_that_always_hangs_raises() -> None:
 
 def test_an_invalid_episode_is_repeated_once() -> None:
     broken = DataError("episode 7, frame 3: state is not finite")
-    numbers, pool, _ = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
+    numbers, group = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
     assert sorted(numbers) == list(range(20))
-    assert pool.replaced == 1
+    assert len(group.workers) == 3
 
 
 def test_an_episode_that_stays_invalid_raises() -> None:
@@ -175,9 +166,9 @@ def test_invalid_episodes_of_one_worker_are_counted_separately() -> None:
         failed.append(number)
         return WorkerReport(0, error=_invalid(number))
 
-    numbers, pool, _ = _run(behaviour, workers=1)
+    numbers, group = _run(behaviour, workers=1)
     assert sorted(numbers) == list(range(20))
-    assert pool.replaced == 2
+    assert len(group.workers) == 3
 
 
 def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
@@ -193,9 +184,9 @@ def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
         worker.alive = False
         return None
 
-    numbers, pool, _ = _run(behaviour)
+    numbers, group = _run(behaviour)
     assert sorted(numbers) == list(range(20))
-    assert pool.replaced == 2
+    assert len(group.workers) == 4
 
 
 def test_the_number_of_an_invalid_episode_is_pickled_with_the_error() -> None:

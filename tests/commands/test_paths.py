@@ -113,7 +113,6 @@ CASES = {
     "egovcp-mcap info": ("RECORDING", ("file",), ("json",)),
     "egovcp-mcap recover": ("RECORDING NEW", ("file",), ("output",)),
     "egovcp-mcap to-dataset": ("RECORDING --dataset.root=NEW", ("files",), ("dataset.root",)),
-    "egovcp-mcap from-dataset": ("DATA NEW", ("dataset.root",), ("output",)),
     "egovcp-experiment ablations": (
         "--output_dir=NEW --scale=smoke --tasks=[ball] --only=[default]",
         ("data.roots", "train.policies"),

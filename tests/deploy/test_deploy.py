@@ -14,12 +14,15 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.log.mcap_reader import read_recording
+from egovcp.log.viewer import LiveRerun
 from egovcp.sim import robot
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
+from egovcp_deploy import recording
 from egovcp_deploy.deploy import main
 from egovcp_deploy.robots.base import ActionResult
 from egovcp_deploy.robots.sim import SimRobot
+from tests.support.sinks import MemorySink
 
 #: The recording alone; drawing it takes longer than the rollout.
 UNDRAWN = ("--log.rrd=false", "--log.videos=0")
@@ -51,17 +54,36 @@ def test_rollouts_are_recorded_and_summed_up(
     assert report["backend"] in BACKENDS
     assert [row["episode"] for row in report["rollouts"]] == [0, 1]
     for i, row in enumerate(report["rollouts"]):
-        recording = read_recording(out / row["mcap"])
-        assert recording.complete
-        assert recording.info.backend == report["backend"]
-        assert (recording.info.seed, recording.info.episode) == (3, i)
-        assert "model.safetensors" in recording.info.hashes
-        assert len(recording.ticks) == row["steps"] == 15
-        assert np.mean([t.reward for t in recording.ticks]) == pytest.approx(row["reward_mean"])
-        assert recording.ticks[-1].success == row["success"]
+        played = read_recording(out / row["mcap"])
+        assert played.complete
+        assert played.info.backend == report["backend"]
+        assert (played.info.seed, played.info.episode) == (3, i)
+        assert "model.safetensors" in played.info.hashes
+        assert len(played.ticks) == row["steps"] == 15
+        assert np.mean([t.reward for t in played.ticks]) == pytest.approx(row["reward_mean"])
+        assert played.ticks[-1].success == row["success"]
     text = capsys.readouterr().out
     assert "rollout 0:" in text
     assert "rollout-0.rrd" in text
+
+
+def test_all_rollouts_are_shown_in_one_spawned_viewer(
+    tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A spawned viewer stays open and keeps its port, so that a second one cannot start."""
+    shown: list[MemorySink] = []
+    starts: list[str] = []
+
+    def sink(log: object, name: str) -> MemorySink:
+        shown.append(MemorySink())
+        return shown[-1]
+
+    monkeypatch.setattr(LiveRerun, "__enter__", lambda live: starts.append(live.kind) or live)
+    monkeypatch.setattr(recording, "AsyncSink", sink)
+    flags = ["--controller=hold", "--episodes=2", "--log.live=spawn", f"--output_dir={tmp_path}"]
+    assert run(*flags, *short, *UNDRAWN) == 0
+    assert starts == ["spawn"]
+    assert [len(viewer.ticks) for viewer in shown] == [15, 15]
 
 
 def test_a_recording_has_the_format_of_the_data(

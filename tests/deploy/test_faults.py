@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -11,16 +12,16 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView, Tick
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.pilot.pilot import HOLD_RATE
-from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
-from egovcp_deploy.pilot.states import OperatorRequest, State
+from egovcp_deploy.pilot.pilot import HOLD_RATE, Pilot
+from egovcp_deploy.pilot.planner import PlannerRunner
+from egovcp_deploy.pilot.states import Facts, OperatorRequest, State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.rollouts import LockstepRunner
+from tests.support.lockstep import DelayedPlanner
 from tests.support.sinks import MemorySink
 
 MS = 1_000_000
@@ -119,10 +120,16 @@ def play(
     delay_ms: Callable[[int], int] = lambda tick: 0,
     operator: Callable[[int], OperatorRequest | None] = lambda tick: None,
 ) -> tuple[list[Tick], Disturbed]:
-    clock, robot, memory = LockstepClock(), Disturbed(sim, tamper), MemorySink()
-    planner = InlinePlanner(PlannerRunner(policy), clock, lambda tick: delay_ms(tick) * MS)
+    robot, memory = Disturbed(sim, tamper), MemorySink()
+    planner = DelayedPlanner(PlannerRunner(policy), lambda tick: delay_ms(tick) * MS)
+    update_state = Pilot.update_state
+
+    def operated(pilot: Pilot, facts: Facts, request: OperatorRequest | None = None) -> State:
+        return update_state(pilot, facts, request or operator(robot.tick))
+
     robot.start(0)
-    LockstepRunner(planner, robot, clock, operator=operator).run(memory)
+    with mock.patch.object(Pilot, "update_state", operated):
+        LockstepRunner(planner, robot).run(memory)
     return memory.ticks, robot
 
 
@@ -167,7 +174,7 @@ def test_a_planner_that_stops_is_noticed_in_200_ms_and_the_hands_ease(sim: SimRo
     assert np.abs(np.diff(after, axis=0)).max() <= HOLD_RATE + 1e-9
     np.testing.assert_allclose(after[-1], 0.0, atol=1e-9)
     assert ticks[-1].base is not None
-    assert ticks[-1].base.position_w[2] > 0.7  # it stands
+    assert ticks[-1].base[2] > 0.7  # it stands
 
 
 def frozen(
@@ -254,11 +261,11 @@ def test_a_damped_robot_sinks_and_the_next_episode_is_normal(
     )
     assert robot.damped_at == 10
     assert ticks[-1].base is not None
-    assert ticks[-1].base.position_w[2] < 0.6
+    assert ticks[-1].base[2] < 0.6
     ticks, _ = play(sim, Steady(0.0))
     assert set(modes(ticks)) == {State.RUN}
     assert ticks[-1].base is not None
-    assert ticks[-1].base.position_w[2] > 0.7
+    assert ticks[-1].base[2] > 0.7
 
 
 def test_the_operator_holds_and_resumes(sim: SimRobot) -> None:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock
 from egovcp.robot_spec import G1
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.pilot import REJECTED
@@ -106,9 +105,7 @@ class FakeRobot:
 
 
 def runner(policy: PlainPolicy, robot: FakeRobot, imagine: int = 16) -> LockstepRunner:
-    clock = LockstepClock(time_ns=123)
-    planner = InlinePlanner(PlannerRunner(policy, imagine), clock)
-    return LockstepRunner(planner, robot, clock)
+    return LockstepRunner(InlinePlanner(PlannerRunner(policy, imagine)), robot)
 
 
 def test_a_tick_holds_observation_action_and_outcome() -> None:

@@ -12,7 +12,6 @@ import pytest
 
 from egovcp.log.mcap_reader import read_recording
 from egovcp.plan import PlannerConfig, Policy
-from egovcp.rate import LockstepClock
 from egovcp.sim.base_env import Observation, StepResult
 from egovcp.sim.env import VectorEnv
 from egovcp.spec import ACTION_DIM, STATE_DIM
@@ -23,6 +22,7 @@ from egovcp_deploy.live.link import encode_observation
 from egovcp_deploy.live.operators import AutomaticOperator
 from egovcp_deploy.live.planner_loop import PlannerLoop
 from egovcp_deploy.pilot.planner import SKIPPED, ObservationMessage, PlannerRunner
+from tests.support.lockstep import LockstepClock
 from tests.support.sinks import MemorySink
 
 BAD_TICK, TICK_NS = 5, 40_000_000

@@ -9,12 +9,12 @@ import draccus
 import pytest
 
 from egovcp.artifact import save_artifact
-from egovcp.data import DatasetWriter, Provenance
+from egovcp.data import DatasetWriter, Provenance, open_dataset
 from egovcp.plan import PlannerConfig
 from egovcp.robot.controllers import WALK, make_controller
 from egovcp.testing import random_episode, toy_model
 from egovcp_collect.config import CollectConfig
-from egovcp_deploy.mcap.cli import main as egovcp_mcap
+from egovcp_collect.dataset.viz import write_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 EPISODES = 4
@@ -56,7 +56,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         policy = folder / name / "checkpoints" / "last" / "pretrained_model"
         shutil.copytree(artifact, policy)
     recording = folder / "rollout-0.mcap"
-    assert egovcp_mcap(["from-dataset", str(folder / "data" / "ball"), str(recording)]) == 0
+    write_recording(open_dataset(folder / "data" / "ball"), 0, recording)
     for copy in ("live/rollout-0.mcap", "runs/ball/rollout-0.mcap", "torn.mcap"):
         (folder / copy).parent.mkdir(exist_ok=True)
         shutil.copy(recording, folder / copy)

@@ -42,7 +42,6 @@ _REDUCED = {
 _EPISODES = re.compile(r"(episodes[=:] ?\"?0:)\d+")
 #: Run elsewhere, or too long: part of a command line -> where it is tested.
 _ELSEWHERE = {
-    "--backend=ray": "tests/collect/test_ray_workers.py",
     "--robot.type=unitree_g1": "tests/deploy/robots/test_fake_command.py",
     "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",

@@ -13,8 +13,8 @@ from egovcp.completion import Shell, completion_script
 
 #: A line that bash completes -> what it puts into COMPREPLY.
 BASH = {
-    "egovcp-collect --back": ["--backend=local", "--backend=ray"],
-    "egovcp-collect --backend=l": ["local"],
+    "egovcp-collect --bound": ["--boundary=reflect", "--boundary=clip"],
+    "egovcp-collect --boundary=r": ["reflect"],
     "egovcp-collect --dataset.ro": ["--dataset.root="],
     "egovcp-dataset c": ["check", "coverage", "card"],
     "egovcp-dataset check --max": ["--max_problems="],
@@ -66,7 +66,7 @@ def test_zsh_offers_subcommands_and_flags(scripts: dict[str, Path], tmp_path: Pa
 
     assert {"check", "push"} <= set(offered("egovcp-dataset c"))
     assert "--max_problems=" in offered("egovcp-dataset check --m")
-    assert "--backend=local" in offered("egovcp-collect --b")
+    assert "--boundary=clip" in offered("egovcp-collect --b")
 
 
 @pytest.mark.skipif(not shutil.which("fish"), reason="needs fish")
@@ -79,4 +79,4 @@ def test_fish_completes_subcommands_flags_and_values(
 
     assert completed("egovcp-dataset che") == ["check"]
     assert completed("egovcp-dataset check --max") == ["--max_problems"]
-    assert set(completed("egovcp-collect --backend=")) == {"--backend=local", "--backend=ray"}
+    assert set(completed("egovcp-collect --boundary=")) == {"--boundary=reflect", "--boundary=clip"}

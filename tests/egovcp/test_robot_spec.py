@@ -95,11 +95,10 @@ def test_a_dataset_keeps_its_robot(tmp_path: Path) -> None:
 
 
 def test_a_dataset_holds_one_robot(tmp_path: Path) -> None:
-    writer = DatasetWriter(tmp_path / "both", _CONTROL)
-    writer.add(random_episode(0))
-    with pytest.raises(DataError, match="robot arm cannot be added to a dataset of robot unitree"):
-        writer.add(random_episode(1, robot=ARM))
-    writer.discard()
+    with DatasetWriter(tmp_path / "both", _CONTROL) as writer:
+        writer.add(random_episode(0))
+        with pytest.raises(DataError, match="arm cannot be added to a dataset of robot unitree"):
+            writer.add(random_episode(1, robot=ARM))
     arm, g1 = _write(tmp_path / "arm", ARM), _write(tmp_path / "g1", G1)
     with pytest.raises(DataError, match="train on the data of one robot"):
         EpisodeIndex.of([arm, g1])

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -157,7 +156,7 @@ def test_another_dataset_of_the_same_scenarios_does_not_continue_a_run(
     assert "its episodes are not those that the run was started with" in capsys.readouterr().err
 
 
-def test_a_moved_one_of_several_datasets_is_named_with_the_whole_flag(
+def test_a_moved_one_of_several_datasets_is_named_with_the_flag(
     arguments: Arguments,
     dataset_root: Path,
     tmp_path: Path,
@@ -166,16 +165,16 @@ def test_a_moved_one_of_several_datasets_is_named_with_the_whole_flag(
     for name in ("a", "b"):
         shutil.copytree(dataset_root, tmp_path / name)
     output = tmp_path / "run"
-    both = f"[{{root: {tmp_path / 'a'}, weight: 2}}, {{root: {tmp_path / 'b'}, weight: 1}}]"
-    assert main(arguments(output, dataset__root=None, datasets=both, steps=3)) == 0
+    both = "[{{root: {0}/a, weight: 2}}, {{root: {0}/{1}, weight: 1}}]"
+    datasets = both.format(tmp_path, "b")
+    assert main(arguments(output, dataset__root=None, datasets=datasets, steps=3)) == 0
     (tmp_path / "b").rename(tmp_path / "c")
     assert main([f"--output_dir={output}", "--resume", "--steps=6"]) == 3
     message = capsys.readouterr().err.strip().splitlines()[-1]
     assert f"no dataset at {tmp_path / 'b'}" in message
-    flag = re.search(r"--datasets='(.*)' with", message)
-    assert flag is not None
-    given = flag[1].replace(str(tmp_path / "b"), str(tmp_path / "c"))
-    assert main([f"--output_dir={output}", "--resume", "--steps=6", f"--datasets={given}"]) == 0
+    assert "resume with --datasets=[{root: FOLDER, ...}, ...]" in message
+    moved = f"--datasets={both.format(tmp_path, 'c')}"
+    assert main([f"--output_dir={output}", "--resume", "--steps=6", moved]) == 0
 
 
 def test_a_second_signal_is_obeyed_at_once(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,8 +24,6 @@ from egovcp.data import (
     ReturnConfig,
     SamplerConfig,
     StreamingSampler,
-    compute_training_stats,
-    estimate_training_stats,
     sample_files,
 )
 from egovcp.data.convert import convert_dataset
@@ -196,29 +193,15 @@ def _pinned[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
     return dataclasses.replace(config, revision=reader.source.commit)
 
 
-def require_datasets(config: TrainConfig, saved: Mapping[str, Any]) -> None:
-    """Raise `DataError`, with a remedy, if a dataset folder of a resumed run is missing.
-
-    Args:
-        config: the options.
-        saved: those that the run has stored.
-    """
-    folders = [d for d in config.datasets or (config.dataset,) if d.root]
-    missing = [local_root(d) for d in folders if not (local_root(d) / INFO_PATH).is_file()]
-    if not missing:
-        return
-    before = saved.get("datasets") or [saved.get("dataset", {})]
-    stored = [str(entry["root"]) for entry in before if entry.get("root")]
-    if not stored:
-        raise DataError(f"no dataset at {missing[0]}")
-    flag = "--dataset.root=FOLDER"
-    if config.datasets:
-        entries = [{k: v for k, v in entry.items() if v not in (None, "")} for entry in before]
-        flag = f"--datasets='{json.dumps(entries)}' with the new folders"
-    raise DataError(
-        f"no dataset at {missing[0]}; {config.output_dir}/{CONFIG_FILE} has {', '.join(stored)}: "
-        f"if the data was moved, resume with {flag}"
-    )
+def require_datasets(config: TrainConfig) -> None:
+    """Raise `DataError`, with a remedy, if a dataset folder of a resumed run is missing."""
+    flag = "--datasets=[{root: FOLDER, ...}, ...]" if config.datasets else "--dataset.root=FOLDER"
+    for dataset in config.datasets or (config.dataset,):
+        if dataset.root and not (local_root(dataset) / INFO_PATH).is_file():
+            raise DataError(
+                f"no dataset at {local_root(dataset)}; {config.output_dir}/{CONFIG_FILE} has the "
+                f"datasets of the run: if the data was moved, resume with {flag}"
+            )
 
 
 def require_same_content(readers: Sequence[DatasetReader], digests: Sequence[str]) -> None:
@@ -283,8 +266,7 @@ def _in_memory(
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
-    complete = np.bincount(np.repeat(learning.dataset, learning.length), weights=learning.mc_valid)
-    _require_returns(readers, learning.dataset, complete)
+    _require_returns(readers, learning)
     set_normalisation(model, learning, config.returns)
     rows = group.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=group.count * sampling.batch_size)
@@ -307,14 +289,11 @@ def _on_disk(
         for part in (sample, unseen):
             part.download()
     heldout = EpisodeStore.read(unseen.subsample(EVALUATION_EPISODES), config.returns)
-    if learning.is_remote:
-        facts = estimate_training_stats(learning, sample, config.returns)
-    else:
-        facts = compute_training_stats(learning, config.returns)
-    _require_returns(readers, sample.dataset, facts.complete)
-    longest = int(learning.length.max())
-    state = facts.state_mean, facts.state_std
-    _set_statistics(model, *state, facts.returns, longest, config.returns)
+    without_images = partial(EpisodeStore.read, sample, config.returns, images=False)
+    store = without_images()
+    _require_returns(readers, store)
+    state = learning.state_statistics() if learning.is_remote else None
+    set_normalisation(model, store, config.returns, state)
     stream = StreamingSampler(
         learning,
         sampling,
@@ -325,21 +304,13 @@ def _on_disk(
         returns=config.returns,
         checked=not learning.is_remote,
     )
-    without_images = partial(EpisodeStore.read, sample, config.returns, images=False)
     return PrefetchIterator(stream), heldout, without_images
 
 
-def _require_returns(
-    readers: Sequence[DatasetReader], dataset: NDArray[np.int64], complete: NDArray[Any]
-) -> None:
-    """Raise `DataError` for one of several datasets without a return that Q can learn.
-
-    Args:
-        readers: the datasets.
-        dataset: (E,) number of the dataset of each episode.
-        complete: (D,) rows of each dataset with a complete return.
-    """
-    without = [number for number in np.unique(dataset).tolist() if not complete[number]]
+def _require_returns(readers: Sequence[DatasetReader], store: EpisodeStore) -> None:
+    """Raise `DataError` for one of several datasets without a return that Q can learn."""
+    complete = np.bincount(np.repeat(store.dataset, store.length), weights=store.mc_valid)
+    without = [number for number in np.unique(store.dataset).tolist() if not complete[number]]
     if without and complete.any():
         raise DataError(
             f"{readers[without[0]].root}: no row has a complete Monte Carlo return, though rows of "
@@ -358,35 +329,28 @@ def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batc
 
 
 def set_normalisation(
-    model: WorldModel, store: EpisodeStore, config: ReturnConfig = _RETURNS
+    model: WorldModel,
+    store: EpisodeStore,
+    config: ReturnConfig = _RETURNS,
+    state: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> None:
     """Set the model's statistics from the training episodes.
 
     Args:
         model: whose statistics are set.
-        store: the episodes.
+        store: the episodes, or a sample of them.
         config: definition of their returns.
+        state: mean and standard deviation (S,) of the state; None: those of ``store``.
 
     Raises:
         DataError: no return is complete, because the episodes are too short.
     """
-    state = store.state.astype(np.float64)
-    returns = store.mc_return[store.mc_valid]
-    _set_statistics(model, state.mean(0), state.std(0), returns, int(store.length.max()), config)
-
-
-def _set_statistics(
-    model: WorldModel,
-    state_mean: NDArray[np.float64],
-    state_std: NDArray[np.float64],
-    returns: NDArray[np.float32],
-    longest: int,
-    config: ReturnConfig,
-) -> None:
-    """As `set_normalisation`: state (74,) each, complete returns (N,), longest episode, ticks."""
-    if len(returns) == 0:
+    if not store.mc_valid.any():
         raise DataError(
-            f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
-            "are not longer than --returns.steps; lower it, or collect longer episodes"
+            f"no row has a complete Monte Carlo return: the episodes (at most {store.length.max()} "
+            "ticks) are not longer than --returns.steps; lower it, or collect longer episodes"
         )
-    model.set_statistics(state_mean, state_std, returns, config.scale != "none", config.gamma)
+    values = store.state.astype(np.float64)
+    mean, std = state or (values.mean(0), values.std(0))
+    returns = store.mc_return[store.mc_valid]
+    model.set_statistics(mean, std, returns, config.scale != "none", config.gamma)

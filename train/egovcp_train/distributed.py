@@ -61,10 +61,6 @@ class ProcessGroup:
         """Sum gradients, in place, and scalar terms over the processes."""
         return terms
 
-    def all_gather(self, rows: Tensor) -> Tensor:
-        """The rows (n, ...) of all processes in their order, on every process."""
-        return rows
-
     def close(self) -> None:
         """Wait for all processes."""
 
@@ -120,11 +116,6 @@ class LaunchedGroup(ProcessGroup):
         for gradient, part in zip(gradients, parts, strict=False):
             gradient.copy_(part.view_as(gradient))
         return dict(zip(terms, (part[0] for part in parts[len(gradients) :]), strict=True))
-
-    def all_gather(self, rows: Tensor) -> Tensor:
-        parts = [torch.empty_like(rows) for _ in range(self.count)]
-        dist.all_gather(parts, rows)
-        return torch.cat(parts)
 
     def close(self) -> None:
         dist.barrier()

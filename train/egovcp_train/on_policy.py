@@ -7,17 +7,19 @@ import io
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from egovcp.bounds import bounded
+from egovcp.cli import save_config
+from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_train.checkpoint import checkpoint_dir, new_checkpoint
+from egovcp_train.checkpoint import CONFIG_FILE, checkpoint_dir, new_checkpoint, restoring
 from egovcp_train.loop import Budget
 from egovcp_train.records import Records, TensorBoardRecorder
 
@@ -155,41 +157,36 @@ class OnPolicyLearner(ABC):
         self.iteration = int(state["iteration"])
 
 
-class OnPolicyConfig(Protocol):
-    """Options that both commands have."""
-
-    @property
-    def steps(self) -> int: ...
-    @property
-    def max_minutes(self) -> float: ...
-    @property
-    def save_freq(self) -> int: ...
-    @property
-    def tensorboard(self) -> bool: ...
-
-
 def run_iterations(
     learner: OnPolicyLearner,
-    config: OnPolicyConfig,
+    config: Any,
     output: Path,
+    state: dict[str, Any],
     write_policy: Callable[[Path], None],
     summary: Callable[[dict[str, float]], dict[str, str]],
-    spent: float = 0.0,
-) -> tuple[Path, bool]:
+    final_message: Callable[[Path, str], str],
+) -> None:
     """Train until the budget or a signal ends the run; the last state is always saved.
 
     Args:
         learner: what is trained.
-        config: its budget.
+        config: options of the command, which are stored.
         output: folder of the run.
+        state: training state from which the run is resumed; empty without ``config.resume``.
         write_policy: writes the policy to a folder.
         summary: scalars of an iteration -> text beside the progress bar.
-        spent: seconds that the run took before it was resumed.
+        final_message: folder of the last policy and "done" or "stopped early" -> text at the end.
 
-    Returns:
-        The folder of the last policy, and whether the budget is spent.
+    Raises:
+        ArtifactError: the training state does not fit the options.
+        KeyboardInterrupt: a signal ended the run early.
     """
-    budget = Budget(config.steps, config.max_minutes, spent=spent)
+    if config.resume:
+        with restoring(output):
+            learner.load_state_dict(state)
+    output.mkdir(parents=True, exist_ok=True)
+    save_config(replace(config, resume=False), str(output / CONFIG_FILE))
+    budget = Budget(config.steps, config.max_minutes, spent=float(state.get("seconds", 0.0)))
     recorder = Records([TensorBoardRecorder(output)] if config.tensorboard else [])
 
     def save() -> None:
@@ -219,5 +216,8 @@ def run_iterations(
     if learner.iteration > start and learner.iteration % config.save_freq:
         save()
     recorder.close()
-    final = checkpoint_dir(output, learner.iteration) / "pretrained_model"
-    return final, budget.progress(learner.steps) >= 1.0
+    finished = budget.progress(learner.steps) >= 1.0
+    folder = checkpoint_dir(output, learner.iteration) / "pretrained_model"
+    echo(final_message(folder, "done" if finished else "stopped early"))
+    if not finished:
+        raise KeyboardInterrupt

@@ -36,7 +36,6 @@ from egovcp_train.checkpoint import (
     pretrained_weights,
     restoring,
     resumed_options,
-    saved_options,
 )
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import PRESETS, TrainConfig
@@ -331,7 +330,7 @@ def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
         return Path(config.output_dir)
     output = prepare_output(config.output_dir, config.resume)
     if config.resume:
-        require_datasets(config, saved_options(TrainConfig, output))
+        require_datasets(config)
     return output
 
 

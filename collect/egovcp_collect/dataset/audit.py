@@ -21,7 +21,7 @@ from egovcp.sim.scenario import Scenario
 from egovcp.terminal import echo
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 from egovcp_collect.provenance import installed_versions, migrate_config
-from egovcp_collect.simulation import Simulation, StepCallback
+from egovcp_collect.simulation import Simulation
 
 _RUN_S = 0.5  # of simulation before finished episodes are yielded
 
@@ -70,17 +70,11 @@ def run_audit(config: AuditConfig) -> None:
     echo(f"{reader.root}: {len(episodes)} episodes simulated again, the same bit for bit")
 
 
-def resimulate(
-    reader: DatasetReader,
-    episodes: Sequence[int],
-    on_step: StepCallback | None = None,
-    render_depth: bool = True,
-) -> Iterator[tuple[int, Episode]]:
+def resimulate(reader: DatasetReader, episodes: Sequence[int]) -> Iterator[tuple[int, Episode]]:
     """Simulate recorded episodes again.
 
     Args:
         episodes: indices in the dataset.
-        on_step: see `Simulation`, as ``render_depth``; a row's scenario identifies its episode.
 
     Yields:
         Index and content of each episode, in the order in which they end.
@@ -96,7 +90,7 @@ def resimulate(
     for indices in groups.values():
         scenarios = [scenario_of(reader, index) for index in indices]
         index_of = {s.episode: index for s, index in zip(scenarios, indices, strict=True)}
-        simulation = Simulation(_recorded_config(reader, indices[0]), on_step, render_depth)
+        simulation = Simulation(_recorded_config(reader, indices[0]))
         simulation.add(scenarios)
         while not simulation.idle:
             for number, episode in simulation.run(_RUN_S)[1]:

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
-from egovcp.data.paths import hidden_files
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
 from egovcp.outputs import output_file, write_report
@@ -60,7 +59,7 @@ def run_check(config: CheckConfig) -> None:
         echo(one_line(problem))
     for note in notes:
         echo(one_line(f"not checked: {note}"))
-    if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
+    if hidden := sum(len(list((root / name).rglob(".*"))) for name in ("data", "meta")):
         folders = shlex.join([str(root / "data"), str(root / "meta")])
         echo(
             f"ignored {hidden} hidden files and folders such as ._NAME of macOS, which LeRobot "

@@ -21,7 +21,7 @@ COMMANDS: Final = CommandGroup(
             ("audit", "audit:run_audit", "simulate episodes again; compare them bit for bit", ""),
             ("coverage", "coverage:run_coverage", "report events, returns, actions; assess it", ""),
             ("card", "card:run_card", "write its dataset card, README.md, with plots", ""),
-            ("viz", "viz:run_viz", "show an episode in Rerun: depth, robot, actions, rewards", ""),
+            ("viz", "viz:run_viz", "show an episode in Rerun, or write it as MCAP", ""),
             ("push", "hub:run_push", "publish it on the Hub: data, card and tags, one commit", ""),
             ("pull", "hub:run_pull", "download one commit from the Hub to a new folder", ""),
         )
@@ -29,6 +29,3 @@ COMMANDS: Final = CommandGroup(
     "DATASET is a folder, or an id of the Hub (user/name) where no such folder exists.",
 )
 main = COMMANDS.main
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egovcp.data import Episode, metadata, schema
 from egovcp.data.lerobot import episode_runs
@@ -23,34 +21,16 @@ from egovcp.data.parquet import (
 from egovcp.data.paths import files_below
 from egovcp.errors import DataError
 from egovcp.robot_spec import G1, RobotSpec
-from egovcp_collect.dataset.record_index import Record
 
 _TIMESTAMP_TOLERANCE_S: Final = 1e-3  # timestamps are float32
 
 
-@dataclass(frozen=True)
-class RecoveredEpisode:
+class RecoveredEpisode(NamedTuple):
     """The rows of an episode without its record."""
 
     file: Path
-    number: int
-    """Its ``episode_index`` in the file."""
-    arrays: dict[str, NDArray[Any]]
-    robot: RobotSpec = G1
-
-    def episode(self, record: Record) -> Episode:
-        """The episode with the task, time limit and metadata of its record."""
-        return Episode(
-            **self.arrays,
-            task=record["task"],
-            time_limit=record["time_limit"],
-            metadata=record.get("metadata", {}),
-            robot=self.robot,
-        )
-
-    def digest(self) -> str:
-        """`Episode.digest`, which does not depend on the record."""
-        return self.episode({"task": "", "time_limit": 0}).digest()
+    number: int  # its ``episode_index`` in the file
+    episode: Episode  # without task, time limit and metadata, on which its digest does not depend
 
 
 def recover_episodes(root: Path) -> Iterator[RecoveredEpisode | DataError]:
@@ -90,5 +70,5 @@ def _assemble(
     if wrong.any():
         problem = f"its frame indices or timestamps do not count at {robot.planner_hz} Hz from 0"
         return DataError.at(path, problem, number, int(np.argmax(wrong)))
-    arrays = {name: columns[key] for name, key in EPISODE_FEATURES.items()}
-    return RecoveredEpisode(path, number, arrays, robot)
+    arrays: dict[str, Any] = {name: columns[key] for name, key in EPISODE_FEATURES.items()}
+    return RecoveredEpisode(path, number, Episode(**arrays, task="", time_limit=0, robot=robot))

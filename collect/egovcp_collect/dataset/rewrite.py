@@ -164,16 +164,12 @@ def run_repair(config: RepairConfig) -> None:
     command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
     index = RecordIndex.build(root, originals, command)
     dropped: list[DataError] = []
-    writer = DatasetWriter(output, index.provenance)
-    try:
+    with suppress(_NothingKept), DatasetWriter(output, index.provenance) as writer:
         for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
             writer.add(episode)
-    except BaseException:
-        writer.discard()
-        raise
-    kept, frames = writer.num_episodes, writer.num_frames
-    writer.finalize() if kept else writer.discard()
-    _report(config, root, output, kept, frames, dropped)
+        if not writer.num_episodes:
+            raise _NothingKept
+    _report(config, root, output, writer.num_episodes, writer.num_frames, dropped)
 
 
 def _report(
@@ -236,7 +232,7 @@ def _validate(
     finder: DuplicateFinder[int],
 ) -> Episode | DataError:
     """The episode with its record, or its first problem."""
-    digest = found.digest()
+    digest = found.episode.digest()
     record = index.find(digest, found.number)
     if record is None:
         problem = (
@@ -244,7 +240,12 @@ def _validate(
             "comes from another dataset"
         )
         return DataError.at(found.file, problem, found.number)
-    episode = found.episode(record)
+    episode = replace(
+        found.episode,
+        task=record["task"],
+        time_limit=record["time_limit"],
+        metadata=record.get("metadata", {}),
+    )
     for frame, problem in itertools.chain(episode.problems(), command_problems(episode)):
         return DataError.at(found.file, problem, found.number, frame)
     try:

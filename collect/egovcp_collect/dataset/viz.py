@@ -1,4 +1,4 @@
-"""`egovcp-dataset viz`: an episode of a dataset as a Rerun recording."""
+"""`egovcp-dataset viz`: an episode of a dataset as a recording."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
+from egovcp.log.tick import Sink
 from egovcp.outputs import output_file, require_writable
 from egovcp.packages import require_packages
 from egovcp.rollouts import POSE, run_info, ticks_of
@@ -33,16 +34,18 @@ class VizConfig:
     episode: int = 0
     """Index of the episode, counted from 0."""
     output: str = output_file()
-    """Recording to create; empty: NAME-episode-N.rrd in the current folder."""
+    """Recording to create; empty: NAME-episode-N.rrd in the current folder. A name that ends in
+    .mcap: the same format as egovcp-deploy, for egovcp-mcap and --robot.type=replay."""
     spawn: bool = False
     """Open the recording in the Rerun viewer."""
 
 
 def run_viz(config: VizConfig) -> None:
     """Write the recording."""
-    require_packages("egovcp-collect", "the recording", "rerun")
+    require_packages("egovcp-collect", "the recording", "mcap", "rerun")
     source = locate(config.dataset)
-    own = DatasetReader.open(config.dataset) if is_own(source.root) else None
+    only_own = config.output.endswith(".mcap")
+    own = DatasetReader.open(config.dataset) if only_own or is_own(source.root) else None
     other = LeRobotReader.open(source.root) if own is None else None
     count = len(own) if own is not None else len(other.rows) if other is not None else 0
     if not 0 <= config.episode < count:
@@ -68,12 +71,16 @@ def run_viz(config: VizConfig) -> None:
 
 
 def write_recording(reader: DatasetReader, index: int, output: Path, meshes: bool = True) -> None:
-    """Write episode ``index`` as the new Rerun recording ``output``."""
+    """Write episode ``index`` as the new recording ``output``: MCAP by its name, else Rerun."""
+    from egovcp.log.mcap import McapSink
     from egovcp.log.rerun import RerunSink
 
     episode = reader.read(index)
     output.parent.mkdir(parents=True, exist_ok=True)
-    sink = RerunSink(output, meshes=meshes, signals=True)
+    if output.suffix == ".mcap":
+        sink: Sink = McapSink(output)
+    else:
+        sink = RerunSink(output, meshes=meshes, signals=True)
     sink.open(run_info(reader, index, episode))
     with removed_on_error(output):
         for tick in ticks_of(episode):

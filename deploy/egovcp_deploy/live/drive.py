@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,19 +15,25 @@ from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, SafetyStop
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
-from egovcp.log.sink import Sink
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import ControlSetup
-from egovcp_deploy.live.operators import Operator, open_operator
+from egovcp_deploy.live.operators import open_operator
 from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
 from egovcp_deploy.live.processes import running_control, simulated_robot, stop_control
 from egovcp_deploy.options import make_output_dir
 from egovcp_deploy.pilot.planner import PlannerRunner, backend_of
-from egovcp_deploy.recording import missing_ticks, percentiles, provenance, recording, run_info
+from egovcp_deploy.recording import (
+    missing_ticks,
+    open_viewer,
+    percentiles,
+    provenance,
+    recording,
+    run_info,
+)
 
 SIMULATED_S: Final = 15.0  # in RUN: release from the gantry, settling, the episode
 
@@ -78,12 +83,23 @@ def _run(
     try:
         with (
             open_operator(config.operator) as operator,
-            recording(folder, 0, info, config.log, blocking=False) as sink,
+            open_viewer(config.log) as viewer,
+            recording(folder, 0, info, config.log, viewer, blocking=False) as sink,
             tqdm(unit="tick", desc="live") as bar,
+            running_control(setup) as control,
         ):
-            summary = run_live(
-                setup, runner, operator, sink, lambda tick: _show(bar, tick), stays, stands
+            process, watchdog, clock = control.process, control.watchdog, MonotonicClock()
+            loop = PlannerLoop(
+                runner, control.link, operator, sink, clock, process.is_alive, stays, stands
             )
+            watchdog.expected = lambda: loop.quitting
+            summary = loop.run(lambda tick: _show(bar, tick))
+            stop_control(process, loop)
+            watchdog.join_if_ended()
+            if watchdog.acted and summary.ticks:
+                summary.damped = f"the control process died (exit code {process.exitcode})"
+            elif not summary.ticks and summary.failure is None:
+                control.check_alive()
         summary.missing_ticks = missing_ticks(sink)
     except EgovcpError:
         for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
@@ -93,33 +109,6 @@ def _run(
     write_json(folder / "deploy.json", report)
     _print(summary, info, folder)
     _raise_failure(summary, folder)
-
-
-def run_live(
-    setup: ControlSetup,
-    runner: PlannerRunner,
-    operator: Operator,
-    sink: Sink,
-    on_tick: Callable[[Tick], None],
-    stays: bool,
-    stands: bool,
-) -> LiveSummary:
-    """Drive the robot until the operator ends the run or its motors are damped; raises
-    `EnvironmentFailure` if the robot does not answer or the control process does not start."""
-    with running_control(setup) as control:
-        process, watchdog = control.process, control.watchdog
-        loop = PlannerLoop(
-            runner, control.link, operator, sink, MonotonicClock(), process.is_alive, stays, stands
-        )
-        watchdog.expected = lambda: loop.quitting
-        summary = loop.run(on_tick)
-        stop_control(process, loop)
-        watchdog.join_if_ended()
-        if watchdog.acted and summary.ticks:
-            summary.damped = f"the control process died (exit code {process.exitcode})"
-        elif not summary.ticks and summary.failure is None:
-            control.check_alive()
-        return summary
 
 
 def _raise_failure(summary: LiveSummary, folder: Path) -> None:

@@ -14,8 +14,7 @@ from typing import Final
 
 from egovcp.errors import EgovcpError
 from egovcp.log.async_sink import warn_on_stderr
-from egovcp.log.sink import Sink
-from egovcp.log.tick import Tick
+from egovcp.log.tick import Sink, Tick
 from egovcp.rate import Clock
 from egovcp.spec import PLANNER_DT
 from egovcp.workers import stop_on_signal

@@ -1,4 +1,4 @@
-"""`egovcp-mcap`: inspect recorded runs, recover torn ones, convert them to datasets and back."""
+"""`egovcp-mcap`: inspect recorded runs, recover torn ones, convert them to datasets."""
 
 from typing import Final
 
@@ -6,7 +6,7 @@ from egovcp.subcommands import CommandGroup, Subcommand
 
 COMMANDS: Final = CommandGroup(
     "egovcp-mcap",
-    "Inspect recorded runs (MCAP), recover torn ones, convert them to datasets and back.",
+    "Inspect recorded runs (MCAP), recover torn ones, convert them to datasets.",
     {
         "info": Subcommand(
             "egovcp_deploy.mcap.info:run",
@@ -23,14 +23,6 @@ COMMANDS: Final = CommandGroup(
             "convert rollouts to a new LeRobot dataset for training (--dataset.root)",
             more="files",
         ),
-        "from-dataset": Subcommand(
-            "egovcp_deploy.mcap.from_dataset:run",
-            "convert an episode of a dataset to a recording (--episode)",
-            ("dataset", "output"),
-        ),
     },
 )
 main = COMMANDS.main
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from egovcp.errors import UsageError
+from egovcp.files import removed_on_error
 from egovcp.log.mcap import McapFile
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.outputs import output_file
@@ -44,16 +45,13 @@ def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:
     the losses."""
     reader = RecordingReader(source)
     copy = McapFile(output)
-    copy.open(reader.metadata)
+    copy.create(reader.metadata)
     ticks = 0
-    try:
+    with removed_on_error(output):
         for raw in reader.raw_ticks():
             for topic, message in raw.messages.items():
                 copy.add(reader.topics[topic], raw.index, raw.time_ns, message.data)
             copy.flush()
             ticks += 1
         copy.close()
-    except BaseException:
-        copy.discard()
-        raise
     return ticks, reader

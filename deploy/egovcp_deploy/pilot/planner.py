@@ -9,10 +9,9 @@ it in lock-step with simulated time; `live.link.RemotePlanner` reaches it in ano
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol
 
 import numpy as np
 import torch
@@ -29,7 +28,6 @@ from egovcp.plan import (
 )
 from egovcp.plan.objective import Dynamics
 from egovcp.plan.value_map import HAND_AXES
-from egovcp.rate import Clock
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.spec import ACTION_BOX, ACTION_HANDS
 
@@ -75,19 +73,6 @@ class RolloutPolicy(Protocol):
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Advance by a tick with the actions (E, 7) that were sent."""
-        ...
-
-
-@runtime_checkable
-class ImaginingPolicy(RolloutPolicy, Protocol):
-    """A policy with a world model to decode, between `act` and `advance`."""
-
-    def reconstruct(self) -> NDArray[np.float32]:
-        """(E, 48, 64) m: depth decoded from the posterior."""
-        ...
-
-    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
-        """(E, horizon, 48, 64) m: depth predicted along the plans (E, N, 7)."""
         ...
 
 
@@ -211,7 +196,8 @@ class PlannerRunner:
         self._policy = policy
         self._budget = AdaptiveBudget(policy.config) if isinstance(policy, Policy) else None
         self._imagine = imagine
-        self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
+        decodes = imagine and hasattr(policy, "reconstruct")  # as a `Policy`
+        self._imagining: Any = policy if decodes else None
         self._next_tick: int | None = None
 
     def plan(
@@ -290,40 +276,22 @@ class PlannerRunner:
 
 
 class InlinePlanner:
-    """A `PlannerClient` in lock-step with simulated time. ``delay_ns`` is the simulated planning
-    time by tick; observations wait while the planner is busy."""
+    """A `PlannerClient` in lock-step with simulated time: planning takes none of it."""
 
     alive = True  # exceptions are raised in this process
 
-    def __init__(
-        self, runner: PlannerRunner, clock: Clock, delay_ns: Callable[[int], int] = lambda tick: 0
-    ) -> None:
+    def __init__(self, runner: PlannerRunner) -> None:
         self._runner = runner
-        self._clock = clock
-        self._delay_ns = delay_ns
-        self._waiting: deque[ObservationMessage] = deque(maxlen=BACKLOG)
-        self._ready: tuple[int, PlanMessage] | None = None
+        self._plans: list[PlanMessage] = []
 
     def submit(self, observation: ObservationMessage) -> None:
-        """Send o_t; an idle planner begins at once."""
-        self._waiting.append(observation)
-        self._begin(self._clock.now_ns())
+        """Plan from o_t."""
+        self._plans.append(self._runner.decode(self._runner.plan([observation])))
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
-        """Plans that are due by ``now_ns``."""
-        plans = []
-        while self._ready is not None and self._ready[0] <= now_ns:
-            ready_ns, plan = self._ready
-            plans.append(plan)
-            self._ready = None
-            self._begin(ready_ns)
+        """The plans since the last call."""
+        plans, self._plans = self._plans, []
         return plans
-
-    def _begin(self, now_ns: int) -> None:
-        if self._ready is None and self._waiting:
-            plan = self._runner.decode(self._runner.plan(list(self._waiting)))
-            self._waiting.clear()
-            self._ready = (now_ns + self._delay_ns(plan.tick), plan)
 
 
 def planner_fields(plan: PlanMessage | None, robot: RobotSpec = G1) -> dict[str, Any]:

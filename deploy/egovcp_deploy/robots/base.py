@@ -14,9 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import BasePose, MotorReadings, SceneObject
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import EFFORT_LIMIT
-from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
+from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES, Solid
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,8 @@ class RobotObservation:
 
     depth: NDArray[np.uint16]  # (48, 64) planar depth, mm, 0 invalid
     state: NDArray[np.float32]  # (74,) proprioception in the layout of `spec.STATE_SLICES`
-    base: BasePose | None = None
-    scene: tuple[SceneObject, ...] = ()
+    base: Array | None = None  # (7,) see `Tick`
+    scene: tuple[Solid, ...] = ()
 
 
 @dataclass(frozen=True)

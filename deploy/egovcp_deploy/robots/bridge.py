@@ -102,21 +102,6 @@ class BridgeConfig:
         check_bounds(self)
 
 
-@dataclass
-class BridgeCounters:
-    """Messages received and sent."""
-
-    readings: int = 0
-    implausible: int = 0  # rejected readings that no G1 can produce (`plausibility`)
-    repeated: int = 0
-    """Readings identical to the last one: sensor noise never repeats, so the driver is stuck."""
-    malformed: int = 0  # messages that are not states
-    sent: int = 0
-    dropped: int = 0  # commands that were not sent because no bridge was connected
-    invalid: int = 0  # commands that were not sent because no motor could follow them
-    problem: str = ""  # reason for the last rejected reading or command
-
-
 class CommandConflictDetector:
     """Detects whether another program commands the motors.
 
@@ -177,7 +162,6 @@ class BridgeRobot:
 
     def __init__(self, config: BridgeConfig | None = None) -> None:
         self.config = config or BridgeConfig()
-        self.counters = BridgeCounters()
         self.arrivals = ArrivalMonitor()
         """Arrivals of usable readings; unusable messages count as lost."""
         self._conflicts = CommandConflictDetector()
@@ -186,6 +170,8 @@ class BridgeRobot:
         self._payload = b""
         self._mode: int | None = None  # of the first reading
         self._mode_changed_ns: int | None = None
+        self._malformed = 0  # messages that are not states
+        self._implausible = 0  # rejected readings that no G1 can produce (`plausibility`)
         self._rejected = 0  # readings since the newest usable one
         self._rejection = ""
         self._subscriber: Subscriber | None = None
@@ -226,21 +212,19 @@ class BridgeRobot:
 
     def _handle(self, payload: bytes, time_ns: int) -> bool:
         """Process a message that arrived at ``time_ns``; whether it is a usable reading."""
-        if payload == self._payload:
-            self.counters.repeated += 1
+        if payload == self._payload:  # sensor noise never repeats: the driver is stuck
             return False
         self._payload = payload
         try:
             state = decode_state(payload, time_ns)
         except MalformedMessage as error:
-            self.counters.malformed += 1
+            self._malformed += 1
             self._reject(str(error), time_ns)
             return False
         if problem := self._filter.check(state):
-            self.counters.implausible += 1
+            self._implausible += 1
             self._reject(problem, time_ns)
             return False
-        self.counters.readings += 1
         self.arrivals.record_arrival(time_ns)
         self._conflicts.update(state)
         self._track_mode(state)
@@ -251,7 +235,7 @@ class BridgeRobot:
     def _reject(self, problem: str, time_ns: int) -> None:
         self.arrivals.record_loss(time_ns)
         self._rejected += 1
-        self._rejection = self.counters.problem = problem
+        self._rejection = problem
 
     def _track_mode(self, state: LowState) -> None:
         if self._mode is None:
@@ -266,17 +250,13 @@ class BridgeRobot:
         return self._newest
 
     def write(self, command: MotorCommand) -> None:
-        """Send joint targets; a command that cannot be sent is counted in `counters`."""
+        """Send joint targets; drops a command that no motor could follow, and every command while
+        no bridge is connected."""
         try:
             self._commands.send(encode_command(command), zmq.NOBLOCK)
-        except MalformedMessage as error:
-            self.counters.invalid += 1
-            self.counters.problem = str(error)
-        except zmq.Again:
-            self.counters.dropped += 1
-        else:
-            self.counters.sent += 1
-            self._conflicts.record_command(command)
+        except (MalformedMessage, zmq.Again):
+            return
+        self._conflicts.record_command(command)
 
     @property
     def refusal(self) -> str:
@@ -319,17 +299,16 @@ class BridgeRobot:
 
     def _timeout_reason(self, timeout: float) -> str:
         """Why no reading arrived."""
-        counters = self.counters
         where = f"{self.config.host}:{self.config.state_port}"
-        if counters.malformed:
+        if self._malformed:
             return (
-                f"{counters.malformed} messages from {where}, none a state of a G1: "
-                f"{counters.problem}; expected LeRobot's bridge there, of lerobot 0.6"
+                f"{self._malformed} messages from {where}, none a state of a G1: "
+                f"{self._rejection}; expected LeRobot's bridge there, of lerobot 0.6"
             )
-        if counters.implausible:
+        if self._implausible:
             return (
-                f"{counters.implausible} states from {where}, none that a G1 can be in: "
-                f"{counters.problem}; check the robot's sensors and joints"
+                f"{self._implausible} states from {where}, none that a G1 can be in: "
+                f"{self._rejection}; check the robot's sensors and joints"
             )
         if reason := connection_error(self.config.host, self.config.state_port):
             return f"nothing at {where} ({reason}): expected LeRobot's bridge; {_START}"

@@ -94,7 +94,3 @@ def serve(config: DepthServerConfig) -> None:
             rate.wait()
     finally:
         camera.close()
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

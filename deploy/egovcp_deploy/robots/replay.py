@@ -107,8 +107,8 @@ def open_recordings(path: Path) -> ReplayRobot:
         return ReplayRobot([path])
     if (path / "meta" / "info.json").is_file():
         raise UsageError(
-            f"{path} is a dataset; make a recording of an episode first: egovcp-mcap from-dataset "
-            f"{path} OUT.mcap --episode=N"
+            f"{path} is a dataset; make a recording of an episode first: egovcp-dataset viz "
+            f"{path} --output=OUT.mcap --episode=N"
         )
     found = sorted(path.glob("*.mcap"), key=_number)
     if not found:

@@ -7,13 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import BasePose, CameraView, SceneObject
+from egovcp.log.tick import CameraView
 from egovcp.sim.base_env import BaseVectorEnv, Observation
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot_env import make_env
-from egovcp.sim.tasks.base import Solid
 from egovcp.sim.tasks.registry import find_task
-from egovcp.spec import ACTION_TERMS
+from egovcp.spec import ACTION_TERMS, Solid
 from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
@@ -106,14 +105,6 @@ class SimRobot:
         self._env.close()
 
 
-def true_poses(env: BaseVectorEnv, row: int) -> tuple[BasePose, tuple[SceneObject, ...]]:
-    """Poses of base and scene of one robot."""
-    base = env.instances[row].base_pose
-    scene = tuple(_scene_object(solid) for solid in env.instances[row].task.solids())
-    return BasePose(base[:3].copy(), base[3:].copy()), scene
-
-
-def _scene_object(solid: Solid) -> SceneObject:
-    x, y, z = map(float, solid.position_w)
-    qw, qx, qy, qz = map(float, solid.quaternion_w)
-    return SceneObject(solid.name, solid.shape, (x, y, z), (qw, qx, qy, qz), solid.size)
+def true_poses(env: BaseVectorEnv, row: int) -> tuple[NDArray[np.float64], tuple[Solid, ...]]:
+    """Pose (7,) of the base and the scene of one robot, see `Tick`."""
+    return env.instances[row].base_pose.copy(), env.instances[row].task.solids()

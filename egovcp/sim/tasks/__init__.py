@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from egovcp.robot_spec import Mirror, RobotSpec
     from egovcp.sim.mujoco_robot import MujocoRobot
     from egovcp.sim.scene import HANDS, HEAD, LEG, PARTS, TORSO, Contact
-    from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+    from egovcp.sim.tasks.base import Array, ObjectState, Task
     from egovcp.sim.tasks.robot_task import RobotTask
-    from egovcp.spec import ActionBox
+    from egovcp.spec import ActionBox, Solid
 
 __all__ = [
     "HANDS",
@@ -46,9 +46,9 @@ __all__ = [
 #: Imported on first use, because it needs MuJoCo; a robot has options without the simulator.
 _MODULES = {
     **dict.fromkeys(("HANDS", "HEAD", "LEG", "PARTS", "TORSO", "Contact"), "egovcp.sim.scene"),
-    **dict.fromkeys(("Array", "ObjectState", "Solid", "Task"), "egovcp.sim.tasks.base"),
+    **dict.fromkeys(("Array", "ObjectState", "Task"), "egovcp.sim.tasks.base"),
     **dict.fromkeys(("Mirror", "RobotSpec"), "egovcp.robot_spec"),
-    "ActionBox": "egovcp.spec",
+    **dict.fromkeys(("ActionBox", "Solid"), "egovcp.spec"),
     "MujocoRobot": "egovcp.sim.mujoco_robot",
     "RobotTask": "egovcp.sim.tasks.robot_task",
 }

@@ -16,8 +16,9 @@ import numpy as np
 
 from egovcp.bounds import bounded
 from egovcp.sim.scene import HANDS, HEAD, LEG, TORSO, Contact
-from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.sim.tasks.base import Array, ObjectState, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
+from egovcp.spec import Solid
 
 if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig

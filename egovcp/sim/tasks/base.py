@@ -15,7 +15,7 @@ import numpy as np
 
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.sim.scene import PARTS, Contact
-from egovcp.sim.tasks.base_task import Array, BaseTask, ObjectState, Solid
+from egovcp.sim.tasks.base_task import Array, BaseTask, ObjectState
 from egovcp.spec import (
     ACTION_BOX,
     CONTROLLER_TICKS_PER_PLAN,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from egovcp.sim.robot import SimulatedRobot
     from egovcp.sim.scenario import Scenario
 
-__all__ = ["Array", "ObjectState", "Solid", "Task"]
+__all__ = ["Array", "ObjectState", "Task"]
 
 PHYSICS_STEPS_PER_TICK: Final = CONTROLLER_TICKS_PER_PLAN * PHYSICS_STEPS_PER_CONTROLLER_TICK
 FALL_HEIGHT: Final = 0.40  # m, pelvis; the lowest command is 0.52

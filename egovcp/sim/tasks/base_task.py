@@ -15,24 +15,13 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.tasks.options import EpisodeConfig, TaskConfig
-from egovcp.spec import ACTION_RATE_LIMIT
+from egovcp.spec import ACTION_RATE_LIMIT, Solid
 
 if TYPE_CHECKING:
     from egovcp.sim.config import BaseEnvConfig, EnvConfig
     from egovcp.sim.scenario import Scenario
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Solid:
-    """An object in the scene, for visualisation."""
-
-    name: str
-    shape: Literal["sphere", "box"]
-    size: tuple[float, float, float]  # Half sizes of a box, or the radius three times, m
-    position_w: Array  # (3,) centre, m
-    quaternion_w: Array  # (4,) wxyz
 
 
 @dataclass(frozen=True)

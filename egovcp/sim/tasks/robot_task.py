@@ -12,7 +12,8 @@ import numpy as np
 from egovcp.errors import EgovcpError
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.mujoco_robot import MujocoRobot
-from egovcp.sim.tasks.base_task import Array, BaseTask, Solid
+from egovcp.sim.tasks.base_task import Array, BaseTask
+from egovcp.spec import Solid
 
 _CONSTANTS: Final = (-0.7, 0.0, 0.7)
 _GRID_ACTIONS: Final = 4  # more would make the grid of constant actions too large

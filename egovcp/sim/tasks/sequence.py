@@ -17,11 +17,11 @@ from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
-from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.sim.tasks.base import Array, ObjectState, Task
 from egovcp.sim.tasks.options import MAX_TICKS, EpisodeConfig
 from egovcp.sim.tasks.registry import find_task
 from egovcp.sim.tasks.wall import WallTask
-from egovcp.spec import REWARD_TERMS
+from egovcp.spec import REWARD_TERMS, Solid
 
 if TYPE_CHECKING:
     from egovcp.sim.config import BaseEnvConfig, EnvConfig

@@ -14,14 +14,13 @@ from egovcp_experiment.report import ExperimentReport, Part, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
 
 SUMMARY: Final = "CEM, iCEM, MPPI and random shooting in equal time; termination rules"
-#: Rule -> flags of egovcp-eval; the search is the policy's own.
+#: Rule -> flags of egovcp-eval; the search is the policy's own. ``default`` has
+#: termination_rule=shift and action_parameterization=target, unless it was trained with others.
 RULES: Final[dict[str, Flags]] = {
     "default": {},
     "rule_paper": {"planner.termination_rule": "paper"},
-    "rule_shift": {"planner.termination_rule": "shift"},
     "rule_survival": {"planner.termination_rule": "survival"},
     "random_walk": {"planner.action_parameterization": "random_walk"},
-    "target": {"planner.action_parameterization": "target"},
     "latent_sample": {"planner.latent": "sample"},
 }
 

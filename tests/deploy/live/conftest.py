@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock
 from egovcp.robot.stance import StanceController
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, ServoCommand
@@ -19,9 +18,10 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, JOINT_NAMES
 from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.planner import InlinePlanner, ObservationMessage, PlannerRunner
+from egovcp_deploy.pilot.planner import ObservationMessage, PlannerRunner
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import DepthImage, LowState, MotorCommand
+from tests.support.lockstep import DelayedPlanner, LockstepClock
 
 TICK_NS = 20_000_000
 QUICK = [
@@ -158,7 +158,7 @@ class Reaching:
         self.sent.append(sent[0].copy())
 
 
-class EventPlanner(InlinePlanner):
+class EventPlanner(DelayedPlanner):
     """Remembers the events of all reports."""
 
     events: list[str]
@@ -225,7 +225,7 @@ def make_rig() -> Callable[..., Rig]:
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)
         runner = PlannerRunner(policy)
-        planner = EventPlanner(runner, clock, lambda tick: delay_ms(tick) * 1_000_000)
+        planner = EventPlanner(runner, lambda tick: delay_ms(tick) * 1_000_000)
         planner.events = []
         controller = StanceController()
         loop = ControlLoop(

@@ -18,7 +18,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock, MonotonicClock
+from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, Phase
@@ -34,8 +34,9 @@ from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.command import EpisodeSequencer
+from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
+from tests.support.lockstep import LockstepClock
 from tests.support.robots.fake_g1 import FakeG1Thread, bridge_config
 from tests.support.robots.sim_low_level import SimLowLevelRobot
 
@@ -132,11 +133,10 @@ def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -
     robot = LiveRobot(EnvConfig(controller=name, ball_episode=quiet))
     robot.start(Scenario("ball", 0, 0))
     body = SimLowLevelRobot(robot)
-    episodes = EpisodeSequencer(
-        body, lambda n: Scenario("ball", 0, n) if n < 3 else None, pause=pause
-    )
+    config = FakeG1Config(pause=pause)
+    episodes = EpisodeSequencer(body, config, lambda n: Scenario("ball", 0, n) if n < 3 else None)
     clock, controller = LockstepClock(), make_controller(name)
-    planner = InlinePlanner(PlannerRunner(Crouching()), clock)
+    planner = InlinePlanner(PlannerRunner(Crouching()))
     loop = ControlLoop(body, body.camera, controller, Pilot(planner, Limits()))
     operator, remote = AutomaticOperator(), RemoteOperator()
     seen: set[tuple[Phase, State]] = set()

@@ -11,12 +11,12 @@ import pytest
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_DIM, STATE_DIM
 from egovcp_deploy.live.link import decode_operator_command, encode_observation
 from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop
 from egovcp_deploy.pilot.planner import ObservationMessage, PlannerRunner
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
+from tests.support.lockstep import LockstepClock
 from tests.support.sinks import MemorySink
 
 TICK_NS = 40_000_000

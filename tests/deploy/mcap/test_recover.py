@@ -159,7 +159,6 @@ def test_other_files_are_refused_in_one_line(
         ["recover", "a"],
         ["to-dataset"],
         ["to-dataset", "--gaps=mend", "a"],
-        ["from-dataset", "a"],
         ["info", "a", "--nonsense=1"],
     ],
 )

@@ -16,6 +16,7 @@ from egovcp.data import DatasetReader, open_dataset
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
 from egovcp.rollouts import CONTROLLER
+from egovcp_collect.dataset.viz import write_recording
 from egovcp_deploy.mcap.cli import main
 
 from .conftest import INFO, Record
@@ -26,7 +27,7 @@ def test_episode_to_recording_to_episode_is_the_identity(
 ) -> None:
     files = [str(tmp_path / f"{index}.mcap") for index in range(len(dataset))]
     for index, file in enumerate(files):
-        assert main(["from-dataset", str(dataset.root), file, f"--episode={index}"]) == 0
+        write_recording(dataset, index, Path(file))
     assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'back'}"]) == 0
     back = open_dataset(tmp_path / "back")
     assert list(dataset_problems(back.root)) == []

@@ -15,6 +15,7 @@ from egovcp_deploy.robots.base import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot, mode_refusal, mode_warning
 from egovcp_deploy.robots.fake import FakeBridge
 from egovcp_deploy.robots.fake.bridge import MODE
+from egovcp_deploy.robots.wire import encode_command
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
 from tests.support.ports import free_port
 from tests.support.robots.fake_g1 import FakeG1Thread, bridge_config, eventually
@@ -52,23 +53,20 @@ def test_commands_reach_the_motors(robot: BridgeRobot, running: FakeG1Thread) ->
         return fake.commanded
 
     assert eventually(commanded)
-    assert robot.counters.sent > 0
-    assert fake.counters.ignored == fake.counters.malformed == 0
 
 
 def test_write_still_works_after_stop_receiving(robot: BridgeRobot, running: FakeG1Thread) -> None:
     robot.stop_receiving()
-    last, readings = robot.read(), robot.counters.readings
-    before = running.fake.counters.commands
+    last = robot.read()
+    received: list[bytes] = []
+    running.fake.on_command = received.append
 
     def commanded() -> bool:
         robot.write(hold(robot))
-        return running.fake.counters.commands > before + 20
+        return len(received) > 20 and running.fake.commanded  # it knows the robot's mode
 
     assert eventually(commanded)
     assert robot.read() is last
-    assert robot.counters.readings == readings
-    assert running.fake.counters.ignored == 0  # it knows the robot's mode
     robot.close()
 
 
@@ -82,35 +80,33 @@ def test_read_returns_the_last_reading_without_messages(
     assert robot.read() is last
 
 
-def test_repeated_readings_are_counted_and_ignored(
-    robot: BridgeRobot, running: FakeG1Thread
-) -> None:
-    running.fake.faults.freeze_state = True
-    assert eventually(lambda: robot.counters.repeated > 3)
-    last = robot.read()
-    seen = robot.counters.repeated
-    assert eventually(lambda: robot.counters.repeated > seen + 3)
-    assert robot.read() is last
+def test_repeated_readings_are_ignored(fake: FakeBridge) -> None:
+    robot, payload = BridgeRobot(), fake._encode_state()
+    assert robot._handle(payload, 1)
+    assert not robot._handle(payload, 2)
+    assert robot.read().time_ns == 1
 
 
-def test_truncated_messages_are_dropped_and_counted(
-    robot: BridgeRobot, running: FakeG1Thread
-) -> None:
+def test_truncated_messages_are_dropped(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.truncate_state = True
-    assert eventually(lambda: robot.counters.malformed > 3)
-    good = robot.counters.readings
-    assert eventually(lambda: robot.counters.readings > good + 3)
-    assert "JSON" in robot.counters.problem
+    assert eventually(lambda: robot._malformed > 3)
+    assert "JSON" in robot._rejection
+    for _ in range(3):
+        last = robot.read()
+        assert eventually(lambda last=last: robot.read() is not last)
 
 
-def test_an_invalid_command_is_not_sent(robot: BridgeRobot) -> None:
+def test_an_invalid_command_is_not_sent(robot: BridgeRobot, running: FakeG1Thread) -> None:
+    received: list[bytes] = []
+    running.fake.on_command = received.append
     robot.write(MotorCommand(np.full(29, np.nan), STIFFNESS, DAMPING, MODE))
     robot.write(MotorCommand(ZERO, -STIFFNESS, DAMPING, MODE))
-    assert robot.counters.invalid == 2
-    assert robot.counters.sent == 0
+    robot.write(DAMP)
+    assert eventually(lambda: bool(received))
+    assert received == [encode_command(DAMP)]
 
 
-def test_commands_without_a_connection_are_dropped_and_counted(
+def test_commands_without_a_connection_are_dropped(
     robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.stop()
@@ -119,20 +115,19 @@ def test_commands_without_a_connection_are_dropped_and_counted(
 
     def dropped() -> bool:
         robot.write(DAMP)
-        return robot.counters.dropped > 0
+        return not robot._commands.poll(0, zmq.POLLOUT)
 
     assert eventually(dropped)
+    robot.write(DAMP)
     with zmq.Context() as context, context.socket(zmq.PULL) as bridge:
         bridge.bind(f"tcp://{ports.host}:{ports.command_port}")
         assert not bridge.poll(500), "an old command must not reach a restarted bridge"
-        before = robot.counters.sent
 
         def sent() -> bool:
             robot.write(DAMP)
-            return robot.counters.sent > before
+            return bool(bridge.poll(0))
 
         assert eventually(sent)
-        assert bridge.poll(2000)
 
 
 def test_readings_resume_after_a_restart_of_the_bridge(
@@ -184,7 +179,7 @@ def test_connect_reports_another_service(publisher: zmq.Socket[bytes]) -> None:
 
     def garbled() -> bool:
         publisher.send(b'{"images": %d}' % next(count))
-        return robot.counters.malformed > 0
+        return robot._malformed > 0
 
     assert eventually(garbled)
     assert "none a state of a G1" in robot._timeout_reason(1.0)
@@ -283,10 +278,10 @@ def test_implausible_readings_are_rejected_and_counted(
 ) -> None:
     assert eventually(lambda: robot.read() is not None)
     unaltered, running.fake.alter_state = running.fake.alter_state, edited(edit)
-    assert eventually(lambda: robot.counters.implausible > 3)
+    assert eventually(lambda: robot._implausible > 3)
     seen = robot.read()
     assert words in robot.rejected
-    assert eventually(lambda: robot.counters.implausible > 6)
+    assert eventually(lambda: robot._implausible > 6)
     assert robot.read() is seen
     running.fake.alter_state = unaltered
     assert eventually(lambda: not robot.rejected)

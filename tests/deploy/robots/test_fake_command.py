@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.rate import LockstepClock
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 from egovcp_deploy.robots.fake.command import StepPacer, main
+from tests.support.lockstep import LockstepClock
 
 FLAGS = (
     "--ports.command_port=0",

@@ -10,7 +10,7 @@ from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX
 from egovcp_deploy.robots.base import MotorCommand, proprioception
-from egovcp_deploy.robots.fake.command import EpisodeSequencer
+from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config
 from tests.support.robots.sim_low_level import SimClock, SimLowLevelRobot
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
@@ -22,10 +22,8 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     robot = SimLowLevelRobot(live)
     episodes = EpisodeSequencer(
         robot,
+        FakeG1Config(gantry=0.3, settle=0.3, pause=0.0),
         lambda n: Scenario("ball", 4, 0) if n == 0 else None,
-        gantry=0.3,
-        settle=0.3,
-        pause=0.0,
     )
     clock = SimClock(episodes.step)
     rate = FixedRate(50, clock)
@@ -42,8 +40,7 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
         age = clock.now_ns() - picture.time_ns
         assert 0 <= age <= (25_000_000 if clock.now_ns() > 200_000_000 else 200_000_000)
         trace += [state.joint_position, picture.depth]
-        rate.wait()
-    assert rate.counters.overruns == 0
+        assert rate.wait() == 0
     return episodes.outcomes, trace
 
 

@@ -100,8 +100,11 @@ def test_a_failure_to_complete_the_files_leaves_nothing(
 
 
 def test_a_dataset_without_episodes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no episode"):
-        DatasetWriter(tmp_path / "new", Provenance("stance-1")).finalize()
+    with (
+        pytest.raises(UsageError, match="no episode"),
+        DatasetWriter(tmp_path / "new", Provenance("stance-1")),
+    ):
+        pass
     assert list(tmp_path.iterdir()) == []
 
 

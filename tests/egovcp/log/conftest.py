@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.log.tick import MODES, BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
-from egovcp.spec import STATE_DIM, STATE_SLICES
+from egovcp.log.tick import MODES, Candidates, MotorReadings, Tick, ValueMap
+from egovcp.spec import STATE_DIM, STATE_SLICES, Solid
 
 MakeTick = Callable[..., Tick]
+_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def _tick(index: int, bare: bool = False) -> Tick:
 
 
 def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
-    ball = (2.0 - 0.1 * index, 0.1, 1.0)
+    ball = np.array([2.0 - 0.1 * index, 0.1, 1.0])
     return {
         "depth_reconstructed": rng.integers(0, 5000, (48, 64)) / 1000.0,
         "depth_imagined": rng.integers(0, 5000, (5, 48, 64)) / 1000.0,
@@ -60,10 +61,10 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
         "reward_terms": {"block": 1.0 * index, "pose": -0.1},
         "success": index > 1,
         "timing_ms": {"filter": 1.5, "plan": 12.0},
-        "base": BasePose(np.array([0.01 * index, 0.0, 0.7]), np.array([1.0, 0.0, 0.0, 0.0])),
+        "base": np.array([0.01 * index, 0.0, 0.7, 1.0, 0.0, 0.0, 0.0]),
         "scene": (
-            SceneObject("ball", "sphere", ball, (1.0, 0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
-            SceneObject("wall", "box", (0.9, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (0.05, 2.0, 1.0)),
+            Solid("ball", "sphere", (0.1, 0.1, 0.1), ball, _UPRIGHT),
+            Solid("wall", "box", (0.05, 2.0, 1.0), np.array([0.9, 0.0, 1.0]), _UPRIGHT),
         ),
         "mode": MODES[index % len(MODES)],
         "motors": _motors(index, rng),

@@ -176,19 +176,6 @@ def test_open_raises_the_error_of_the_sink(tmp_path: Path, warnings: list[str]) 
     assert warnings == []
 
 
-def test_lossless_blocks_instead_of_dropping(
-    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
-) -> None:
-    sink = start(
-        FaultySink(tmp_path / "diary", stall_at=1, stall_s=0.5), queue_ticks=2, lossless=True
-    )
-    for index in range(60):
-        sink.write(make_tick(index))
-    sink.close()
-    assert sum(line.startswith("tick") for line in lines(tmp_path / "diary")) == 60
-    assert (sink.dropped, warnings) == (0, [])
-
-
 def test_a_hanging_sink_does_not_block_the_others(
     tmp_path: Path, make_tick: Any, warnings: list[str]
 ) -> None:

@@ -33,7 +33,7 @@ def test_the_file_is_synchronised_once_a_second(
 
 def test_a_full_disk_keeps_all_written_ticks(small: Path, make_tick: Any) -> None:
     lines: list[str] = []
-    sink = AsyncSink(McapSink(small / "a.mcap"), "a.mcap", lossless=True, warn=lines.append)
+    sink = AsyncSink(McapSink(small / "a.mcap"), "a.mcap", queue_ticks=10**6, warn=lines.append)
     sink.open(RunInfo("ball"))
     index = 0
     while sink.failure is None:
@@ -52,7 +52,7 @@ def test_a_full_disk_keeps_all_written_ticks(small: Path, make_tick: Any) -> Non
 def test_a_full_disk_under_rerun_is_reported_once(small: Path, make_tick: Any) -> None:
     lines: list[str] = []
     rerun = RerunSink(small / "a.rrd", meshes=False)
-    sink = AsyncSink(rerun, "a.rrd", lossless=True, warn=lines.append)
+    sink = AsyncSink(rerun, "a.rrd", queue_ticks=10**6, warn=lines.append)
     sink.open(RunInfo("ball"))
     index = 0
     while sink.failure is None:

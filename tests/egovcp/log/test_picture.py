@@ -25,7 +25,8 @@ from egovcp.log.picture import (
     video_frames,
 )
 from egovcp.log.scene_plot import scene_faces, view_offset
-from egovcp.log.tick import RunInfo, SceneObject
+from egovcp.log.tick import RunInfo
+from egovcp.spec import Solid
 
 
 def test_key_frames_span_the_events(make_tick: Any) -> None:
@@ -112,7 +113,9 @@ def test_the_view_follows_walking_but_not_stumbling(way: tuple[float, float]) ->
 
 @pytest.mark.parametrize("shape", ["sphere", "box"])
 def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
-    thing = SceneObject("a", shape, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (0.2, 0.2, 0.2))
+    thing = Solid(
+        "a", shape, (0.2, 0.2, 0.2), np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    )
     ((corners, _),) = scene_faces([thing])
     a, b, c, d = (corners - (1.0, 2.0, 3.0)).transpose(1, 0, 2)
     normals = np.cross(c - a, d - b)

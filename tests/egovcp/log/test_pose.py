@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from egovcp.log.pose import robot_pose, robot_poses
-from egovcp.log.tick import BasePose, CameraView, RunInfo
+from egovcp.log.tick import CameraView, RunInfo
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import palm_positions
 from egovcp.spec import STATE_SLICES
@@ -37,7 +37,7 @@ def test_without_base_pose_the_pelvis_has_the_tilt_of_the_imu(make_tick: Any) ->
 
 
 def test_palms_are_where_forward_kinematics_puts_them(make_tick: Any) -> None:
-    tick = replace(make_tick(3), base=BasePose(np.array([1.0, 2.0, 0.6]), turned(0.8)))
+    tick = replace(make_tick(3), base=np.array([1.0, 2.0, 0.6, *turned(0.8)]))
     pose = robot_pose(tick)
     np.testing.assert_allclose(
         pose.palms_w, pose.from_heading(palm_positions(tick.state[None])[0]), atol=1e-6
@@ -45,7 +45,7 @@ def test_palms_are_where_forward_kinematics_puts_them(make_tick: Any) -> None:
 
 
 def test_the_heading_frame_turns_with_the_pelvis(make_tick: Any) -> None:
-    base = BasePose(np.array([1.0, 2.0, 0.6]), turned(np.pi / 2))
+    base = np.array([1.0, 2.0, 0.6, *turned(np.pi / 2)])
     pose = robot_pose(replace(make_tick(0), base=base))
     np.testing.assert_allclose(
         pose.from_heading(np.array([1.0, 0.0, 0.1])), [1.0, 3.0, 0.7], atol=1e-9

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from egovcp.log.sink import Fanout
-from egovcp.log.tick import RunInfo
+from egovcp.log.tick import Fanout, RunInfo
 from tests.support.sinks import FaultySink
 
 

@@ -67,7 +67,7 @@ def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick
     assert str(web.web_port) in web.page
     assert web.pid is not None
     process = psutil.Process(web.pid)
-    web.close()
+    web.__exit__()
     assert not process.is_running()
 
 
@@ -156,8 +156,8 @@ def test_a_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         live = LiveRerun("web", Viewer(address(free_port())), web_port=port)
-        with pytest.raises(EnvironmentFailure, match=f"port {port} is in use"):
-            live.start()
+        with pytest.raises(EnvironmentFailure, match=f"port {port} is in use"), live:
+            pass
 
 
 @pytest.mark.parametrize("words", ["", "http://127.0.0.1:9876", "rerun+http://a b:1/proxy", "x"])

@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, network_image, to_metres
+from egovcp.model.depth import extreme_3x3, nearness, network_image, to_metres
 
 MAX_M = spec.DEPTH_MAX_M
 SHAPE = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
@@ -85,6 +85,6 @@ def test_the_network_sees_what_is_measured_and_that_it_is() -> None:
 
 def test_extremes_of_a_neighbourhood_are_those_of_max_pooling() -> None:
     x = torch.rand(2, 5, 6, generator=torch.Generator().manual_seed(0))
-    pooled = torch.nn.functional.max_pool2d(x, 3, stride=1, padding=1)
-    assert torch.equal(highest_3x3(x), pooled)
-    assert torch.equal(lowest_3x3(x), -torch.nn.functional.max_pool2d(-x, 3, stride=1, padding=1))
+    high, low = (torch.nn.functional.max_pool2d(y, 3, stride=1, padding=1) for y in (x, -x))
+    assert torch.equal(extreme_3x3(x, torch.maximum), high)
+    assert torch.equal(extreme_3x3(x, torch.minimum), -low)

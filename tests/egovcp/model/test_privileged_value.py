@@ -120,7 +120,7 @@ def test_q_learns_how_the_value_depends_on_actions_that_were_not_taken() -> None
         carry = filter_sequence(model, batch, sample=False).carry
         action = batch.action.clone()
         low, high = (
-            model.standardised_value(carry, torch.cat([action[..., :1] + x, action[..., 1:]], -1))
+            model.value(carry, torch.cat([action[..., :1] + x, action[..., 1:]], -1))
             for x in (-0.3, 0.3)
         )
     assert (high - low).mean() == pytest.approx(0.6, abs=0.15)

@@ -4,14 +4,13 @@ import dataclasses
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, WorldModelConfig
 from egovcp.model.latent_state import Gaussian
 from egovcp.model.losses import Rollout
 from egovcp.model.value_losses import (
     TargetNetwork,
-    td_target,
     value_and_termination_losses,
     value_targets,
 )
@@ -53,10 +52,18 @@ def _rollout(carry: Carry) -> Rollout:
 
 
 # --- targets --------------------------------------------------------------------------------
+def _targets(
+    model: WorldModel, carry: Carry, batch: Batch, head: nn.Module | None = None
+) -> tuple[Tensor, Tensor]:
+    """Targets (B, T) in units of return, and the rows that have one."""
+    _, value, usable = value_targets(model, carry, batch, head)
+    return value[..., 0] * model.return_std + model.return_mean, usable
+
+
 def test_a_target_is_the_reward_and_the_value_of_the_action_that_followed() -> None:
     model, batch = _model(), random_batch(2, 5)
     carry = _states(model, batch)
-    target, known = td_target(model, carry, batch)
+    target, known = _targets(model, carry, batch)
     assert known.tolist() == [[True] * 4 + [False]] * 2  # what follows the window is not known
     for b in range(2):
         for t in range(4):
@@ -71,28 +78,27 @@ def test_a_failure_has_no_afterwards_and_a_time_limit_no_target() -> None:
     model, batch = _model(), random_batch(2, 5)
     batch.valid[:, 3:] = False
     batch.terminal_next[0, 2] = True
-    target, known = td_target(model, _states(model, batch), batch)
+    target, known = _targets(model, _states(model, batch), batch)
     assert known.tolist() == [
         [True, True, True, False, False],
         [True, True, False, False, False],
     ]
-    assert target[0, 2] == batch.reward[0, 2]
+    torch.testing.assert_close(target[0, 2], batch.reward[0, 2])
 
 
 def test_no_target_reaches_into_another_episode_or_comes_from_burn_in() -> None:
     model, batch = _model(), random_batch(1, 6)
     batch.valid[:, 0] = False
     batch.is_first[:, 3] = True
-    _, known = td_target(model, _states(model, batch), batch)
+    _, known = _targets(model, _states(model, batch), batch)
     assert known.tolist() == [[False, True, False, True, True, False]]
 
 
 def test_what_q_is_fitted_to_is_one_choice() -> None:
     model, batch = _model(), random_batch(2, 5)
     carry = _states(model, batch)
-    action, by_td, known = value_targets(model, carry, batch)
+    action, _, known = value_targets(model, carry, batch)
     assert torch.equal(action[:, :, 0], batch.action)
-    torch.testing.assert_close(by_td[..., 0], (td_target(model, carry, batch)[0] + 2.0) / 3.0)
     assert not known[:, -1].any()
     model.config = DEBUG
     _, by_mc, known = value_targets(model, carry, batch)
@@ -131,8 +137,8 @@ def test_target_network_keeps_the_values_while_the_model_changes(kind: str) -> N
         for parameter in model.value_head.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
         assert not torch.allclose(model.value(carry, batch.action), before)
-        torch.testing.assert_close(model.value_by(network.head, carry, batch.action), before)
-        target, _ = td_target(model, carry, batch, network.head)
+        torch.testing.assert_close(model.value(carry, batch.action, network.head), before)
+        target, _ = _targets(model, carry, batch, network.head)
         torch.testing.assert_close(target[:, :-1], (batch.reward[:, :-1] + 0.9 * before[:, 1:]))
     assert not any(p.requires_grad for p in network.parameters())
 

@@ -330,9 +330,3 @@ def test_candidates_share_the_noise_of_sampled_states() -> None:
     config = dataclasses.replace(SMALL, latent="sample")
     values = evaluate(_NoisyWorld(), Point(executed, goal), plans, config, _generator())
     torch.testing.assert_close(values, values[:, :1].expand_as(values))
-
-
-def test_missing_method_of_the_model_is_named() -> None:
-    config = dataclasses.replace(SMALL, latent="sample")
-    with pytest.raises(UsageError, match="imagine_sample"):
-        _plan(torch.zeros(1, 7), torch.zeros(1, 7), config)

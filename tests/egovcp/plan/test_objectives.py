@@ -201,9 +201,6 @@ def test_a_model_without_reward_head_is_refused(objective: Any) -> None:
     config = plain_planner(objective=objective)
     with pytest.raises(UsageError, match=r"--policy\.loss\.reward=1"):
         make_evaluator(toy_model(), config)
-    start = PointWorld().start(torch.zeros(1, 7), torch.zeros(1, 7))
-    with pytest.raises(UsageError, match="PointWorld has no reward and discount"):
-        evaluate(PointWorld(), start, torch.zeros(1, 2, config.actions, 7), config)
 
 
 def test_sampling_from_an_untrained_prior_std_is_refused() -> None:

@@ -404,13 +404,3 @@ def test_observations_of_another_shape_are_refused_with_what_was_expected() -> N
     for wrong in ((depth, state[:, :73]), (depth[:2], state), (depth[:, :, :32], state)):
         with pytest.raises(UsageError, match=r"expected \(3, 48, 64\) and \(3, 74\)"):
             policy.act(*wrong)
-
-
-def test_warming_up_changes_no_plan() -> None:
-    cold, warm = (Policy(toy_model(), FAST_CONFIG, ROBOTS, seed=4) for _ in range(2))
-    warm.warm_up()
-    for tick in range(2):
-        expected, found = (policy.act(*_observation(tick)) for policy in (cold, warm))
-        np.testing.assert_array_equal(found.plan, expected.plan)
-        cold.advance(expected.action)
-        warm.advance(found.action)

@@ -15,7 +15,7 @@ from egovcp.plan import Plan, PlannerConfig, Policy, ReferenceEvaluator, make_pl
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import BackendName, Objective, OptimiserName
 from egovcp.plan.objective import PlanValue
-from egovcp.plan.search import Deadline, random_walk, reflect_once, target_deltas
+from egovcp.plan.search import random_walk, reflect_once, target_deltas
 from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 from tests.support.worlds import Point, PointWorld, plain_planner
@@ -205,11 +205,6 @@ def test_interrupted_search_equals_one_with_fewer_iterations() -> None:
     assert cut.iterations == 2
     assert torch.equal(cut.actions, whole.actions)
     assert torch.equal(cut.value, whole.value)
-
-
-def test_no_deadline_always_allows_an_iteration() -> None:
-    pace = Deadline(None)
-    assert all(pace.allows_iteration() for _ in range(100))
 
 
 def test_a_policy_passes_its_deadline_on_and_reports_iterations() -> None:

@@ -234,7 +234,6 @@ class FaultRig:
     def _hang_up(self) -> None:
         self._robot.start(Scenario("ball", 0, 0))
         self._robot.drive(DAMPED)
-        self.fake.next_episode()
 
     def _start(self, stack: ExitStack) -> None:
         ports, fov = self.fake.ports, self._robot.config.camera.vertical_fov

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.plan import PolicyStep
-from egovcp.rate import LockstepClock
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import evaluation_config
 from egovcp.sim.live import LiveRobot, Phase
@@ -27,6 +26,7 @@ from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
+from tests.support.lockstep import LockstepClock
 
 from .sim_low_level import STEP_NS, SimLowLevelRobot
 
@@ -154,7 +154,7 @@ class HealthyRun:
         clock = LockstepClock()
         checked = _CheckedRobot(robot, clock, alarms)
         checked.step()
-        pilot = Pilot(InlinePlanner(PlannerRunner(_OraclePolicy(robot)), clock), state=State.ARMED)
+        pilot = Pilot(InlinePlanner(PlannerRunner(_OraclePolicy(robot))), state=State.ARMED)
         controller = make_controller(self._situation.controller)
         loop = ControlLoop(checked, checked.camera, controller, pilot)
         limit = min(max_s, _STEERED_S if self._situation.steered else np.inf)

@@ -49,7 +49,6 @@ class SimLowLevelRobot:
     def __init__(self, robot: LiveRobot, mode: int = 0) -> None:
         self.robot = robot
         self.pressed: frozenset[str] = frozenset()
-        self.episode = 0
         self.camera = SimDepthCamera(self)
         self._mode = mode
         self._servos = DAMPED
@@ -65,10 +64,6 @@ class SimLowLevelRobot:
     def commanded(self) -> bool:
         """Whether the last command has stiffness, so that the motors hold a pose."""
         return bool(self._servos.stiffness.any())
-
-    def next_episode(self) -> None:
-        """Notify that `robot` has started another episode."""
-        self.episode += 1
 
     def step(self) -> None:
         """Advance by 5 ms."""
@@ -108,14 +103,12 @@ class SimDepthCamera:
 
     def __init__(self, robot: SimLowLevelRobot) -> None:
         self._robot = robot
-        self._image: tuple[int, int] | None = None  # episode and step
         self._newest: DepthImage | None = None
 
     def read(self) -> DepthImage:
         """Return the newest image that has come out of the camera."""
-        step, depth = self._robot.robot.depth_image
-        if self._newest is None or (self._robot.episode, step) != self._image:
-            self._image = (self._robot.episode, step)
+        _, depth = self._robot.robot.depth_image
+        if self._newest is None or self._newest.depth is not depth:
             self._newest = DepthImage(self._robot.time_ns, depth)
         return self._newest
 

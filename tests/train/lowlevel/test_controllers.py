@@ -8,7 +8,8 @@ import pytest
 from safetensors import safe_open
 
 from egovcp.robot.controllers import make_controller
-from egovcp.robot.walking import ACTIONS, WalkConfig, WalkingController
+from egovcp.robot.walk_policy import WalkPolicy
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig, WalkingController
 from egovcp.sim.config import SensorConfig
 from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.skills import SKILLS, Skill, walking
@@ -16,14 +17,11 @@ from egovcp_train.lowlevel.trial import SkillOutcome, play
 
 
 # --- the gait without a policy --------------------------------------------------------
-class NoResidual:
-    """A policy that leaves everything to what surrounds it."""
-
-    config = WalkConfig()
-    digest = "none"
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        return np.zeros((len(observation), ACTIONS), np.float32)
+def no_residual() -> WalkPolicy:
+    """A policy of action 0, which leaves everything to stance law and gait."""
+    zeros, ones = np.zeros(OBSERVATION_DIM, np.float32), np.ones(OBSERVATION_DIM, np.float32)
+    bias = np.zeros(ACTIONS, np.float32)
+    return WalkPolicy(zeros, ones, ((np.outer(bias, zeros), bias),), WalkConfig(), {})
 
 
 @pytest.mark.parametrize(
@@ -32,7 +30,7 @@ class NoResidual:
 def test_robots_of_randomised_physics_are_still_up_and_walking_after_two_seconds(seed: int):
     skill = Skill("alone", "", 2.0, walking((0.1, 0.6), (0.70, 0.74)))
     physics, sensors = DisturbanceConfig(models=16), SensorConfig()
-    outcome = play(WalkingController(NoResidual()), skill, 16, seed, physics, sensors, "points")
+    outcome = play(WalkingController(no_residual()), skill, 16, seed, physics, sensors, "points")
     assert outcome.survived.mean() > 0.7
     assert outcome.stepping.min() > 0.6
 

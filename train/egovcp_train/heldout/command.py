@@ -159,7 +159,3 @@ def _show(output: Path, report: HeldoutReport, depth_max_m: float) -> None:
         echo(f"picture: {output / name}.png")
     if recording := record(report, output, depth_max_m):
         echo(f"recording: rerun {recording}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

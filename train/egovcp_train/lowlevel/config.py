@@ -8,21 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from egovcp.bounds import bounded, check_bounds
-from egovcp.errors import UsageError
+from egovcp.bounds import bounded, check_bounds, check_ranges
 
 Range = tuple[float, float]
-
-
-def _check_ranges(where: str, config: object) -> None:
-    """Raise `UsageError` for a (low, high) pair with low > high, nested ones included."""
-    for name, value in vars(config).items():
-        pairs = value if isinstance(value, tuple) and isinstance(value[0], tuple) else (value,)
-        for pair in pairs:
-            if isinstance(pair, tuple) and pair[0] > pair[1]:
-                raise UsageError(
-                    f"expected low <= high, found {pair[0]} > {pair[1]} in task.{where}.{name}"
-                )
 
 
 @dataclass(frozen=True)
@@ -60,7 +48,7 @@ class CommandConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        _check_ranges("commands", self)
+        check_ranges("task.commands", self)
 
 
 @dataclass(frozen=True)
@@ -93,7 +81,7 @@ class DisturbanceConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        _check_ranges("disturbances", self)
+        check_ranges("task.disturbances", self)
 
 
 @dataclass(frozen=True)

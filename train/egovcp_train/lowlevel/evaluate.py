@@ -283,7 +283,3 @@ def _cell(value: float | None, scale: float, digits: int = 1) -> str:
 
 def _cells(values: Sequence[float] | None, digits: int) -> str:
     return "" if values is None else "/".join(f"{value:.{digits}f}" for value in values)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,21 +14,14 @@ import draccus
 import torch
 
 from egovcp.bounds import MAX_PER_CORE, bounded
-from egovcp.cli import given_options, run_command, save_config
+from egovcp.cli import given_options, run_command
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import load_walk_policy
 from egovcp.robot.walk_policy import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig, require_memory_for_robots
-from egovcp.terminal import echo
-from egovcp_train.checkpoint import (
-    CONFIG_FILE,
-    load_training_state,
-    prepare_output,
-    restoring,
-    resumed_options,
-)
+from egovcp_train.checkpoint import load_training_state, prepare_output, resumed_options
 from egovcp_train.lowlevel.config import CurriculumConfig, LowLevelTask, NetworkConfig
 from egovcp_train.on_policy import RslRlPpoConfig, run_iterations
 
@@ -118,21 +112,22 @@ def train(config: LowLevelTrainConfig) -> None:
     torch.set_num_threads(threads)
     torch.manual_seed(config.seed)
     init = load_walk_policy(config.init) if config.init and not config.resume else None
+    state = load_training_state(output) if config.resume else {}
     learner = _build(config, threads)
-    spent = 0.0
-    try:
-        if config.resume:
-            state = load_training_state(output)
-            spent = float(state["seconds"])
-            with restoring(output):
-                learner.load_state_dict(state)
-        elif init is not None:
+
+    def final_message(folder: Path, outcome: str) -> str:
+        final, difficulty = folder / POLICY_FILE, learner.env.logic.difficulty
+        return (
+            f"{PROG}: {outcome} after {learner.steps} steps, difficulty {difficulty:.2f}\n"
+            f"controller: {final}\n"
+            f"next: egovcp-eval-lowlevel --controller={final} --output_dir=..."
+        )
+
+    with contextlib.closing(learner.env):
+        if init is not None:
             learner.start_from(init)
-        output.mkdir(parents=True, exist_ok=True)
-        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-        _run(config, output, learner, spent)
-    finally:
-        learner.env.close()
+        write_policy = partial(_write_policy, config, learner)
+        run_iterations(learner, config, output, state, write_policy, _summary, final_message)
 
 
 def _build(config: LowLevelTrainConfig, threads: int) -> Any:
@@ -155,29 +150,19 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
     return LowLevelLearner(env, config.network, config.ppo, config.curriculum, config.critic_warmup)
 
 
-def _run(config: LowLevelTrainConfig, output: Path, learner: Any, spent: float) -> None:
+def _write_policy(config: LowLevelTrainConfig, learner: Any, folder: Path) -> None:
     from egovcp_train.lowlevel.learner import walk_policy
 
-    def write_policy(folder: Path) -> None:
-        provenance = {
-            "command": [PROG, *sys.argv[1:]],
-            "seed": config.seed,
-            "steps": learner.steps,
-            "difficulty": float(learner.env.logic.difficulty),
-            "train_config": draccus.encode(config),
-        }
-        policy = walk_policy(learner.ppo.get_policy(), config.walk, provenance)
-        policy.save(folder / POLICY_FILE)
-        export_onnx(policy, folder / ONNX_FILE)
-
-    folder, finished = run_iterations(learner, config, output, write_policy, _summary, spent)
-    state = "done" if finished else "stopped early"
-    difficulty = learner.env.logic.difficulty
-    echo(f"{PROG}: {state} after {learner.steps} steps, difficulty {difficulty:.2f}")
-    echo(f"controller: {folder / POLICY_FILE}")
-    echo(f"next: egovcp-eval-lowlevel --controller={folder / POLICY_FILE} --output_dir=...")
-    if not finished:
-        raise KeyboardInterrupt
+    provenance = {
+        "command": [PROG, *sys.argv[1:]],
+        "seed": config.seed,
+        "steps": learner.steps,
+        "difficulty": float(learner.env.logic.difficulty),
+        "train_config": draccus.encode(config),
+    }
+    policy = walk_policy(learner.ppo.get_policy(), config.walk, provenance)
+    policy.save(folder / POLICY_FILE)
+    export_onnx(policy, folder / ONNX_FILE)
 
 
 def _summary(scalars: dict[str, float]) -> dict[str, str]:
@@ -187,7 +172,3 @@ def _summary(scalars: dict[str, float]) -> dict[str, str]:
         "v": f"{scalars['reward/velocity']:.2f}",
         "reward": f"{scalars['reward/total']:.2f}",
     }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import SimulationDiverged, UsageError
-from egovcp.log.tick import BasePose, RunInfo, Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.robot.arms import nearest_reachable
 from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.g1 import WAIST
@@ -292,7 +292,7 @@ class SkillRecorder:
                 state,
                 action_planned=action,
                 action_sent=action,
-                base=BasePose(x.position[0].copy(), x.quaternion[0].copy()),
+                base=np.concatenate([x.position[0], x.quaternion[0]]),
             )
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Sequence
@@ -12,19 +13,12 @@ from typing import Any
 import draccus
 import torch
 
-from egovcp.cli import run_command, save_config
+from egovcp.cli import run_command
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import absolute_controller, make_controller
 from egovcp.sim.config import require_memory_for_robots
-from egovcp.terminal import echo
-from egovcp_train.checkpoint import (
-    CONFIG_FILE,
-    load_training_state,
-    prepare_output,
-    restoring,
-    resumed_options,
-)
+from egovcp_train.checkpoint import load_training_state, prepare_output, resumed_options
 from egovcp_train.on_policy import run_iterations
 from egovcp_train.ppo.config import PpoTrainConfig
 
@@ -54,15 +48,20 @@ def train(config: PpoTrainConfig) -> None:
     torch.manual_seed(config.seed)
     state = load_training_state(output) if config.resume else {}
     learner = _build(config, int(state.get("episodes", 0)))
-    try:
-        if config.resume:
-            with restoring(output):
-                learner.load_state_dict(state)
-        output.mkdir(parents=True, exist_ok=True)
-        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-        _run(config, output, learner, float(state.get("seconds", 0.0)))
-    finally:
-        learner.env.close()
+
+    def write_policy(folder: Path) -> None:
+        learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
+
+    def final_message(folder: Path, outcome: str) -> str:
+        final = folder / POLICY_FILE
+        return (
+            f"{PROG}: {outcome} after {learner.steps} steps\n"
+            f"policy: {final}\n"
+            f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=..."
+        )
+
+    with contextlib.closing(learner.env):
+        run_iterations(learner, config, output, state, write_policy, _summary, final_message)
 
 
 def _build(config: PpoTrainConfig, first_episode: int) -> Any:
@@ -71,19 +70,6 @@ def _build(config: PpoTrainConfig, first_episode: int) -> Any:
     from egovcp_train.ppo.learner import ContactLearner
 
     return ContactLearner(config, first_episode)
-
-
-def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:
-    def write_policy(folder: Path) -> None:
-        learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
-
-    folder, finished = run_iterations(learner, config, output, write_policy, _summary, spent)
-    final = folder / POLICY_FILE
-    echo(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
-    echo(f"policy: {final}")
-    echo(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
-    if not finished:
-        raise KeyboardInterrupt
 
 
 def _provenance(config: PpoTrainConfig, learner: Any) -> dict[str, Any]:
@@ -100,7 +86,3 @@ def _provenance(config: PpoTrainConfig, learner: Any) -> dict[str, Any]:
 def _summary(scalars: dict[str, float]) -> dict[str, str]:
     ended = {k: f"{v:.2f}" for k, v in scalars.items() if k.endswith(("/return", "/success"))}
     return {"reward": f"{scalars['reward']:.4f}", **ended}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

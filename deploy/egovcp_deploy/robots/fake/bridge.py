@@ -58,17 +58,6 @@ class Ports:
     """Port for depth images, in the format of egovcp-depth-server."""
 
 
-@dataclass
-class CommandCounters:
-    """Received messages on the command port."""
-
-    commands: int = 0  # applied, or replaced by a newer command within the same step
-    malformed: int = 0
-    ignored: int = 0
-    """For another mode machine, or with ankles and waist commanded motor by motor; a G1 ignores
-    both."""
-
-
 class FakeBridge:
     """Serves one `LiveRobot` that is in an episode; raises `EnvironmentFailure` if a port is in
     use.
@@ -93,7 +82,6 @@ class FakeBridge:
         """Depth message -> the messages that are sent instead."""
         self.on_command: Callable[[bytes], None] = lambda message: None
         """Called with every message on the command port."""
-        self.counters = CommandCounters()
         self._detailed = detailed
         self._rng = np.random.default_rng(0)
         self._time = 0.0  # s of simulated time since the start
@@ -101,8 +89,7 @@ class FakeBridge:
         self._servos = DAMPED
         self._last_state = b""
         self._sequence = 0
-        self._image: tuple[int, int] | None = None  # episode and step of the last image
-        self._episode = 0
+        self._depth: NDArray[np.uint16] | None = None  # of the last image
         self._context = zmq.Context()
         ports = ports or Ports()
         try:
@@ -126,10 +113,6 @@ class FakeBridge:
         """Whether the last command has stiffness, so that the motors hold a pose."""
         return self._servos is not DAMPED and bool(self._servos.stiffness.any())
 
-    def next_episode(self) -> None:
-        """Notify that `robot` has started another episode."""
-        self._episode += 1
-
     def step(self) -> None:
         """Advance by 5 ms."""
         self._receive()
@@ -151,7 +134,6 @@ class FakeBridge:
             self.on_command(waiting[-1])
         while waiting and not self.faults.ignore_commands:
             if self._accept(waiting.pop()):
-                self.counters.commands += len(waiting)
                 break
         if self._time - self._last_command > WATCHDOG_S:
             self._servos = DAMPED
@@ -161,12 +143,9 @@ class FakeBridge:
         try:
             command = decode_command(payload)
         except MalformedMessage:
-            self.counters.malformed += 1
             return False
         if command.motors.mode != self._mode or not command.series:
-            self.counters.ignored += 1
-            return False
-        self.counters.commands += 1
+            return False  # a G1 ignores them too; not series: ankles and waist motor by motor
         self._last_command = self._time
         self._servos = _servos(command)
         return True
@@ -250,9 +229,9 @@ class FakeBridge:
 
     def _publish_image(self) -> None:
         step, depth = self.robot.depth_image
-        if self.faults.stop_camera or (self._episode, step) == self._image:
+        if self.faults.stop_camera or depth is self._depth:
             return
-        self._image = (self._episode, step)
+        self._depth = depth
         if not self.faults.freeze_camera:
             self._sequence += 1
             fov = self.robot.config.camera.vertical_fov

@@ -23,7 +23,7 @@ from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_deploy.options import held_out
+from egovcp_deploy.options import SEEDS, held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 
@@ -51,7 +51,7 @@ class FakeG1Config:
 
     task: str = DEFAULT_TASK
     """Scene: one of `egovcp-task list`, or package.module:Class."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(0, least=0, below=SEEDS)
     """Seed of the held-out scenarios, as in egovcp-eval."""
     episode: int = bounded(0, least=0)
     """Number of the first scenario."""
@@ -115,9 +115,7 @@ def serve(
         return held_out(config.task, config.seed, config.episode + number)
 
     bridge = FakeBridge(robot, config.ports, detailed=config.detailed)
-    episodes = EpisodeSequencer(
-        bridge, scenario, _print, config.gantry, config.settle, config.pause
-    )
+    episodes = EpisodeSequencer(bridge, config, scenario, _print)
     try:
         opened(bridge.ports)
         _step_in_real_time(config, bridge, episodes, interrupts)
@@ -173,27 +171,22 @@ class EpisodeSequencer:
 
     Args:
         robot: advanced by `step`.
+        config: ``gantry``, ``settle`` and ``pause``, in simulated time.
         scenarios: number of an episode -> its scenario; None: there are no more.
         log: called with a line for every change of phase.
-        gantry: time for which the motors must hold a pose before the gantry releases the robot, s
-            of simulated time; None: it waits for `LiveRobot.release`.
-        settle: from there to the beginning of the task, s.
-        pause: from the end of an episode to the next, s, at least `MIN_PAUSE`.
     """
 
     def __init__(
         self,
         robot: FakeBridge,
+        config: FakeG1Config,
         scenarios: Callable[[int], Scenario | None],
         log: Callable[[str], None] = lambda line: None,
-        gantry: float | None = 3.0,
-        settle: float = 2.0,
-        pause: float = 2.0,
     ) -> None:
         self._robot = robot
+        self._config = config
         self._scenarios = scenarios
         self._log = log
-        self._gantry, self._settle, self._pause = gantry, settle, max(MIN_PAUSE, pause)
         self.outcomes: list[EpisodeOutcome] = []
         """Outcomes of the finished episodes."""
         self.finished = False
@@ -206,7 +199,6 @@ class EpisodeSequencer:
             self.finished = True
             return
         self._robot.robot.start(scenario)
-        self._robot.next_episode()
         self._enter(Phase.HELD)
         self._log(f"episode {scenario.episode} ({scenario.task}): on the gantry")
 
@@ -228,11 +220,11 @@ class EpisodeSequencer:
         if self._phase is Phase.HELD:
             if not self._robot.commanded:
                 self._since = 0.0
-            elif self._gantry is not None and self._since > self._gantry:
+            elif self._config.gantry is not None and self._since > self._config.gantry:
                 robot.release()
-        elif self._phase is Phase.FREE and self._since >= self._settle:
+        elif self._phase is Phase.FREE and self._since >= self._config.settle:
             robot.begin()
-        elif self._phase is Phase.OVER and self._since >= self._pause:
+        elif self._phase is Phase.OVER and self._since >= max(MIN_PAUSE, self._config.pause):
             self._start()
 
     def _report(self) -> None:
