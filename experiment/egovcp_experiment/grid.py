@@ -31,6 +31,8 @@ from egovcp_experiment.config import ExperimentConfig
 ALL: Final = "all"
 #: Name of a model or variant without changed flags, which all experiments share.
 DEFAULT: Final = "default"
+#: Name of the variant of the model of all tasks without changed flags.
+MIXED: Final = "mixed"
 #: Controllers of egovcp-eval that need no model.
 REFERENCES: Final = ("hold", "constant", "random", "oracle")
 #: References without a search.

@@ -142,8 +142,7 @@ class TrainConfig:
         ),
         "returns": ("gamma", "steps", "weights", "scale"),
         "sampling": ("length", "mirror", "tasks"),
-        "loading": ("mode", "shuffle"),
-        "loading.shuffle": ("episodes",),
+        "loading": ("mode",),
         "optimizer": ("lr",),
     }
     """Flags of these groups (see `egovcp.flags`); the other options are constants of `PRESETS`."""

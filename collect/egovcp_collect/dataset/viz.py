@@ -35,7 +35,7 @@ class VizConfig:
     """Index of the episode, counted from 0."""
     output: str = output_file()
     """Recording to create; empty: NAME-episode-N.rrd in the current folder. A name that ends in
-    .mcap: the same format as egovcp-deploy, for egovcp-mcap and --robot.type=replay."""
+    .mcap: MCAP, as egovcp-deploy writes and replays it."""
     spawn: bool = False
     """Open the recording in the Rerun viewer."""
 

@@ -13,7 +13,7 @@ from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, Grid, Variant
+from egovcp_experiment.grid import ALL, MIXED, Grid, Variant
 from egovcp_experiment.report import ExperimentReport, Part, Table, percent
 
 SUMMARY: Final = (
@@ -131,7 +131,7 @@ def _plays(grid: Grid) -> dict[str, dict[str, tuple[list[str], str]]]:
     return {
         task: {
             name: (
-                grid.plays(task, Variant(f"in_{name}", play=flags), ALL),
+                grid.plays(task, Variant(f"in_{name}" if flags else MIXED, play=flags), ALL),
                 grid.references(task, f"references-{task}-{name}", flags, _REFERENCES).name,
             )
             for name, flags in row.items()

@@ -11,7 +11,7 @@ from egovcp.eval_scores import EvalScores, points_range
 from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, REFERENCES, Grid, Variant
+from egovcp_experiment.grid import ALL, MIXED, REFERENCES, Grid, Variant
 from egovcp_experiment.report import (
     ExperimentReport,
     Part,
@@ -28,7 +28,7 @@ def _plays(grid: Grid, task: str) -> dict[str, list[str]]:
     """``single`` and ``mixed`` -> names of their cells, one per seed."""
     return {
         "single": grid.plays(task, Variant("single")),
-        "mixed": grid.plays(task, Variant("mixed"), ALL),
+        "mixed": grid.plays(task, Variant(MIXED), ALL),
     }
 
 
