@@ -46,6 +46,8 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
         "the planner computes the cost of action changes in the reward: use "
         "--planner.action_rate_cost"
     ),
+    **dict.fromkeys(("backend", "ray"), "all processes run on this machine: leave it out"),
+    "format": "egovcp-export writes weights in half precision only: leave it out",
     "operator.gamepad": "use the robot's remote control, or --operator.type=keyboard",
     "robot.bridge.consistency": "readings are always checked for consistency: leave it out",
     "train.task_flags": "all tasks share one recipe: use --train.flags",

@@ -1,5 +1,5 @@
 """Converts a LeRobot dataset of any robot into one with the features that the world model learns
-from: an image, a state, an action and a reward (`schema.FEATURES`)."""
+from: an image, a state, an action and a reward."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp import spec
+from egovcp.data import tiff
 from egovcp.data.episode import Episode
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, is_own, values_of
 from egovcp.data.pictures import camera_images
@@ -214,7 +215,7 @@ def _episode(
     if "success" in chosen:
         success = _numbers(table, chosen["success"])[:, 0] > 0
     return Episode(
-        depth=np.stack([_depth(image, robot.depth) for image in images]),
+        depth=np.stack([_depth(image, robot) for image in images]),
         state=_numbers(table, chosen["state"]).astype(np.float32),
         action=action.clip(-1, 1).astype(np.float32),
         reward=_numbers(table, chosen["reward"])[:, 0].astype(np.float32),
@@ -233,20 +234,19 @@ def _numbers(table: pa.Table, feature: Feature) -> NDArray[np.float64]:
     values = values_of(table[feature.key], feature).astype(np.float64)
     finite = np.isfinite(values).all(1)
     if not finite.all():
-        error = DataError(f"{feature.key} is not finite")
-        error.problem, error.frame = str(error), int(np.argmin(finite))
-        raise error
+        raise tiff.frame_error(int(np.argmin(finite)), f"{feature.key} is not finite")
     return values
 
 
-def _depth(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint16]:
-    """A camera image as depth in mm: (H, W) uint16 in mm, (H, W) float32 in m or (H, W, 3) uint8.
+def _depth(image: NDArray[Any], robot: RobotSpec) -> NDArray[np.uint16]:
+    """The image of a camera, (H, W) uint16 in mm, (H, W) float32 in m or (H, W, 3) uint8, as depth
+    in mm with the size and range of ``robot``.
 
-    Depth is sampled, as a mean over an edge would be no surface; colours are averaged.
+    Depth is sampled, because a mean over an edge would lie on no surface; colours are averaged.
     """
     from PIL import Image
 
-    rows, cols = size
+    rows, cols = robot.depth
     if image.ndim == 3 or image.dtype == np.uint8:
         grey = Image.fromarray(image).convert("L").resize((cols, rows), Image.Resampling.BOX)
         return np.asarray(_GREY_MM * (1 + np.asarray(grey).astype(np.uint16)))
@@ -257,7 +257,7 @@ def _depth(image: NDArray[Any], size: tuple[int, int]) -> NDArray[np.uint16]:
     depth = image[at_row][:, at_col].astype(np.float64)
     if np.issubdtype(image.dtype, np.floating):
         depth *= 1000
-    valid = (depth > 0) & (depth <= spec.DEPTH_MAX_M * 1000)
+    valid = (depth > 0) & (depth <= robot.depth_max_m * 1000)
     return np.where(valid, depth, 0).round().astype(np.uint16)
 
 

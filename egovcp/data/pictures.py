@@ -17,6 +17,9 @@ from egovcp.data.lerobot import EpisodeRow, Feature
 from egovcp.errors import DataError
 
 _LARGEST_CODE: Final = 4095  # of a depth video, 12 bits
+#: LeRobot's defaults for depth videos, m.
+_DEPTH_RANGE: Final[Mapping[str, float]] = {"depth_min": 0.01, "depth_max": 10.0}
+_DEPTH_SHIFT: Final = 3.5
 
 
 def camera_images(
@@ -58,11 +61,6 @@ def _depth_of(codes: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.
     shift = float(info.get("video.shift", _DEPTH_SHIFT))
     first, last = math.log(low + shift), math.log(high + shift)
     return (np.exp(first + fraction * (last - first)) - shift).astype(np.float32)
-
-
-#: LeRobot's defaults, m.
-_DEPTH_RANGE: Final[Mapping[str, float]] = {"depth_min": 0.01, "depth_max": 10.0}
-_DEPTH_SHIFT: Final = 3.5
 
 
 def decode_image(content: object, frame: int, key: str) -> Any:

@@ -31,13 +31,15 @@ def test_no_option_of_a_command_is_listed_as_removed() -> None:
         ("egovcp-eval", "--env.arch.head_cost=1", "--env.arch.hit_cost"),
         ("egovcp-train-ppo", "--env.ball.pose_cost=0", "--env.pose_cost"),
         ("egovcp-eval-model", "--return_steps=16", "leave it out"),
+        ("egovcp-collect", "--backend=ray", "leave it out"),
+        ("egovcp-export", "--format=float16", "half precision only"),
     ],
 )
 def test_command_refuses_a_removed_option_in_one_line(
     prog: str, flag: str, remedy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (command,) = (c for c in all_commands() if c.prog == prog)
-    assert command.main([*command.arguments, "--output_dir=x", flag]) == 2
+    assert command.main([*command.arguments, flag, "--output_dir=x"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"{prog}: error: option --")
     assert " was removed" in line
