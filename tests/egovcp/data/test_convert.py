@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -89,6 +91,18 @@ def test_depth_is_in_millimetres(
         rows = ((np.arange(16) + 0.5) * 24 / 16).astype(int)
         sampled = np.asarray(frame[name]).reshape(24, 32)[rows][:, 1::2]
         np.testing.assert_allclose(image, sampled, atol=1.0)
+
+
+def test_an_image_of_16_bits_need_not_be_marked_as_depth(theirs: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(theirs, tmp_path / "theirs"))
+    info = json.loads((root / "meta/info.json").read_text())
+    del info["features"]["observation.depth"]["info"]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    reader = _converted(root, tmp_path / "own", image="observation.depth")
+    marked = _converted(theirs, tmp_path / "marked", image="observation.depth")
+    depth, whole = (np.concatenate([e.depth for e in r]) for r in (reader, marked))
+    assert reader.robot.depth_max_m == 2.56
+    np.testing.assert_array_equal(depth, np.where(whole > 2560, 0, whole))
 
 
 def test_a_colour_video_becomes_grey(
