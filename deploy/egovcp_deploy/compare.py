@@ -15,7 +15,6 @@ from egovcp.values import differences
 from egovcp_deploy.scores import EpisodeScore, aligned, eval_scores, paired
 
 PROG: Final = "egovcp-compare"
-_FILE: Final = "eval_run.json"
 _LIMIT_BYTES: Final = 256 << 20
 #: Options that do not change the results.
 _IRRELEVANT: Final = ("output_dir", "num_envs", "num_workers", "episodes", "constant.path")
@@ -103,14 +102,29 @@ def compare(config: CompareConfig) -> None:
         found = f"{', '.join(run.episodes)} and {', '.join(other.episodes)}"
         raise UsageError(f"{run.folder} and {other.folder} have no task in common: {found}")
     other_controller = config.other_controller or config.controller
-    lines = [
-        _line(
-            task,
-            run.played_by(task, config.controller),
-            other.played_by(task, other_controller),
+    lines = []
+    for task in tasks:
+        a, b = paired(
+            run.played_by(task, config.controller), other.played_by(task, other_controller)
         )
-        for task in tasks
-    ]
+        if not a:
+            raise UsageError(f"no scenario of {task} was played by both")
+        ours, theirs = eval_scores(a), eval_scores(b)
+        success, success_range, reward, reward_range = ours.gain(theirs).columns()
+        lines.append(
+            (
+                task,
+                str(len(a)),
+                f"{ours.success_rate:.1%}",
+                f"{theirs.success_rate:.1%}",
+                success,
+                success_range,
+                f"{ours.reward_per_step:+.5f}",
+                f"{theirs.reward_per_step:+.5f}",
+                reward,
+                reward_range,
+            )
+        )
     echo(f"{config.controller} of {run.folder} compared with {other_controller} of {other.folder}")
     for each in dict.fromkeys(e.folder for e in (run, other) if not e.complete):
         echo(f"{each} is incomplete: egovcp-eval was interrupted")
@@ -123,11 +137,18 @@ def compare(config: CompareConfig) -> None:
 def load_evaluation(folder: Path) -> Evaluation:
     """Read the results of egovcp-eval in ``folder``; raises `DataError` if eval_run.json is missing
     or of another format."""
-    path = folder / _FILE
+    path = folder / "eval_run.json"
+    known = {field.name for field in fields(EpisodeScore)}
     try:
         content = read_json(path, _LIMIT_BYTES)
         episodes = {
-            task: {name: [_score(entry) for entry in played] for name, played in row.items()}
+            task: {
+                name: [
+                    EpisodeScore(**{key: entry[key] for key in entry if key in known})
+                    for entry in played
+                ]
+                for name, played in row.items()
+            }
             for task, row in content["episodes"].items()
         }
         config = dict(content["config"])
@@ -139,30 +160,3 @@ def load_evaluation(folder: Path) -> Evaluation:
         ) from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DataError(f"{path} is not what egovcp-eval writes: {error!r}") from error
-
-
-def _score(entry: Mapping[str, Any]) -> EpisodeScore:
-    known = {field.name for field in fields(EpisodeScore)}
-    return EpisodeScore(**{name: value for name, value in entry.items() if name in known})
-
-
-def _line(
-    task: str, scores: Sequence[EpisodeScore], other_scores: Sequence[EpisodeScore]
-) -> tuple[str, ...]:
-    a, b = paired(scores, other_scores)
-    if not a:
-        raise UsageError(f"no scenario of {task} was played by both")
-    run, other = eval_scores(a), eval_scores(b)
-    success, success_range, reward, reward_range = run.gain(other).columns()
-    return (
-        task,
-        str(len(a)),
-        f"{run.success_rate:.1%}",
-        f"{other.success_rate:.1%}",
-        success,
-        success_range,
-        f"{run.reward_per_step:+.5f}",
-        f"{other.reward_per_step:+.5f}",
-        reward,
-        reward_range,
-    )

@@ -17,10 +17,10 @@ from egovcp.plan import PolicyStep
 from egovcp.sim.base_env import BaseVectorEnv
 from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
 from egovcp.sim.policies import EnvPolicy as SimPolicy
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.scenario import SEARCH, Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.options import PLANNER, for_search
+from egovcp_deploy.options import PLANNER
 from egovcp_deploy.scores import EpisodeScore, eval_scores
 
 type Action = tuple[float, ...]
@@ -95,12 +95,12 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
     """The action of the grid with the highest mean reward per step, by successive halving.
 
     Every candidate plays the same few scenarios; the best quarter play more of them, until one is
-    left. The scenarios are those of `options.for_search`, which no evaluation plays."""
+    left. No evaluation plays these scenarios."""
     scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
     candidates, count = list(scores), _FIRST_ROUND
     while len(candidates) > 1:
         first = len(scores[candidates[0]])
-        scenarios = [for_search(task, seed, first + i) for i in range(count)]
+        scenarios = [Scenario(task, SEARCH + seed, first + i) for i in range(count)]
         for action, played in zip(candidates, play(candidates, scenarios), strict=True):
             scores[action] += played
         candidates.sort(key=lambda action: -eval_scores(scores[action]).reward_per_step)

@@ -50,20 +50,6 @@ class DemoConfig:
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 
-    def rollout(self) -> DeployConfig:
-        """The same as options of `egovcp-deploy`."""
-        return DeployConfig(
-            policy=self.policy,
-            planner=self.planner,
-            task=self.task,
-            episodes=1,
-            seed=self.seed,
-            output_dir=self.output_dir,
-            log=LogOptions(live=self.live),
-            imagine=AHEAD,
-            env=self.env,
-        )
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
@@ -74,7 +60,17 @@ def demo(config: DemoConfig) -> None:
     """Play, record, and name the files. Raises as `egovcp_deploy.deploy.deploy`."""
     require_packages("egovcp-deploy", PROG, *SIMULATOR_MODULES, "matplotlib")
     config.policy.require()
-    rollout = config.rollout()
+    rollout = DeployConfig(
+        policy=config.policy,
+        planner=config.planner,
+        task=config.task,
+        episodes=1,
+        seed=config.seed,
+        output_dir=config.output_dir,
+        log=LogOptions(live=config.live),
+        imagine=AHEAD,
+        env=config.env,
+    )
     check_options(rollout)
     folder = play_rollouts(rollout, load_policy(config.policy, config.planner))
     (folder / "deploy.json").unlink()  # it names the files as egovcp-deploy does

@@ -13,8 +13,8 @@ from egovcp.policy_options import load_policy
 from egovcp.sim.tasks.registry import find_task
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.dry_run import checks, conclude
-from egovcp_deploy.live.drive import drive, drive_simulated
+from egovcp_deploy.dry_run import dry_run
+from egovcp_deploy.live.drive import drive
 from egovcp_deploy.options import PLANNER, check_output_dir
 from egovcp_deploy.robots.realsense_camera import require_realsense
 from egovcp_deploy.rollouts import play_rollouts, replay
@@ -39,7 +39,7 @@ def deploy(config: DeployConfig) -> None:
     `ArtifactError`, `EnvironmentFailure` (simulator, robot, camera, disk) or `SafetyStop`."""
     check_options(config)
     if config.dry_run:
-        conclude(checks(config))
+        dry_run(config)
         return
     planned = config.controller == PLANNER
     artifact = load_policy(config.policy, config.planner) if planned else None
@@ -49,9 +49,8 @@ def deploy(config: DeployConfig) -> None:
     assert artifact is not None, "checked: only lock-step simulation runs without the planner"
     if config.robot.type == "replay":
         show_viewer(replay(config, artifact) / "rollout-0.rrd")
-        return
-    run = {"sim": drive_simulated, "unitree_g1": drive}
-    run[config.robot.type](config, artifact)
+    else:
+        drive(config, artifact)
 
 
 def show_viewer(rrd: Path) -> None:

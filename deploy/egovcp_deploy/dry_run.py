@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
@@ -28,21 +27,13 @@ from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import open_camera
+from egovcp_deploy.live.hardware import AnyCamera, open_camera
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
 from egovcp_deploy.pilot.pilot import posture
 from egovcp_deploy.pilot.planner import BUDGET_S, RolloutPolicy, backend_of
-from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.robots.base import DepthImage, LowState, proprioception
+from egovcp_deploy.robots.base import Array, DepthImage, LowState, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
-from egovcp_deploy.robots.realsense_camera import RealSenseDepthCamera
 from egovcp_deploy.robots.subscriber import ArrivalStats
-from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
-
-Array = NDArray[np.float64]
-type AnyCamera = ZmqDepthCamera | RealSenseDepthCamera
-#: Name, and the function that returns the finding.
-type Check = tuple[str, Callable[[], str]]
 
 FREE_BYTES: Final = 1_000_000_000  # an hour of recording takes about 0.6 GB
 PLAN_BUDGET_MS: Final = 36.0
@@ -58,37 +49,72 @@ RANGE_MARGIN: Final = 0.1  # rad beyond the joint range; more is a wrong zero
 MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1.0
 
 
-def conclude(pending: Iterable[Check]) -> None:
-    """Perform each check and print its result, then go; raises the first error, if any."""
-    errors = []
-    for name, check in pending:
+def dry_run(config: DeployConfig) -> None:
+    """Perform all checks of a run on a robot, also after one has failed; print each result, then
+    go. Raises the first error, if any."""
+    errors: list[EgovcpError] = []
+
+    def perform[T](
+        name: str, check: Callable[[], T], describe: Callable[[T], str] = str
+    ) -> T | None:
         try:
-            echo(f"go     {name}: {check()}")
+            found = check()
+            echo(f"go     {name}: {describe(found)}")
         except EgovcpError as error:
             echo(f"NO-GO  {name}: {error}")
             errors.append(error)
+            return None
+        return found
+
+    robot_options, limits = config.robot, config.robot.limits
+    perform("disk", lambda: check_disk(Path(config.output_dir)))
+    artifact = perform(
+        "policy",
+        lambda: load_policy(config.policy, config.planner),
+        lambda found: f"{found.path}, for the controller {found.controller_id}",
+    )
+    if artifact is not None:
+        perform("planner", lambda: check_plan_time(artifact.make_policy(1, config.seed)))
+    perform("controller", lambda: check_controller(robot_options.controller, artifact))
+    with ExitStack() as stack:
+        robot = perform(
+            "robot",
+            lambda: stack.enter_context(closing(BridgeRobot(robot_options.bridge).connect())),
+            lambda found: f"answers at {found.config.host}",
+        )
+        camera = perform(
+            "camera",
+            lambda: stack.enter_context(closing(open_camera(robot_options.camera))),
+            lambda found: "answers",
+        )
+        measured = measure(robot, camera, LISTEN_S)
+        now = time.monotonic_ns()
+        if robot is not None and (reading := measured.reading) is not None:
+            states = robot.arrivals.stats(now, LISTEN_S)
+            mode = f"mode machine {reading.mode}: 29 joints, waist free"
+            perform("mode", lambda: robot.warning or mode)
+            perform("joints", lambda: joint_offsets(reading.joint_position))
+            perform("posture", lambda: check_posture(reading))
+            perform("motors", lambda: motors(measured))
+            gap_ms = limits.state_hold_s * 1e3
+            perform("states", lambda: check_message_rate(states, STATE_HZ, gap_ms))
+            perform("other publishers", lambda: refused(robot.refusal) or "none detected")
+        if camera is not None:
+            images, image_gap_ms = camera.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
+            perform("images", lambda: check_message_rate(images, IMAGE_HZ, image_gap_ms))
+            max_ms = config.env.delay.image_age[1] * 1e3
+            perform("image age", lambda: image_age(measured.image_ages_ms, max_ms))
     if errors:
         echo(f"no-go: {len(errors)} checks failed")
         raise errors[0]
     echo("go")
 
 
-def checks(config: DeployConfig) -> Iterator[Check]:
-    """All checks of a run on a robot, each to be performed before the next is requested; a failed
-    one does not prevent the others."""
-    artifact: Artifact | None = None
-
-    def check_policy() -> str:
-        nonlocal artifact
-        artifact = load_policy(config.policy, config.planner)
-        return f"{artifact.path}, for the controller {artifact.controller_id}"
-
-    yield "disk", lambda: check_disk(Path(config.output_dir))
-    yield "policy", check_policy
-    if artifact is not None:
-        policy = artifact.make_policy(1, config.seed)
-        yield "planner", lambda: check_plan_time(policy)
-    yield from check_hardware(config, artifact)
+def refused(reason: str) -> str:
+    """Raise `EnvironmentFailure` with ``reason`` unless it is empty."""
+    if reason:
+        raise EnvironmentFailure(reason)
+    return reason
 
 
 # --- this machine and the policy -------------------------------------------------------------
@@ -103,6 +129,14 @@ def check_disk(folder: Path) -> str:
             "free disk space, or choose another --output_dir"
         )
     return f"{free / 1e9:.0f} GB free"
+
+
+def check_controller(name: str, artifact: Artifact | None) -> str:
+    """Identity of the low-level controller ``name``, which must be that of the policy, if any."""
+    found = make_controller(name).id
+    if artifact is not None:
+        artifact.require_controller(found)
+    return found
 
 
 def check_plan_time(policy: RolloutPolicy) -> str:
@@ -138,71 +172,6 @@ class Measurements:
     refusal: str = ""  # reason why arming is refused
     motor_events: list[str] = field(default_factory=list)
     image_ages_ms: list[float] = field(default_factory=list)  # at their arrival
-
-
-def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[Check]:
-    """Controller, robot and camera."""
-
-    def check_controller() -> str:
-        found = make_controller(config.robot.controller).id
-        if artifact is not None:
-            artifact.require_controller(found)
-        return found
-
-    yield "controller", check_controller
-    limits = config.robot.limits
-    with ExitStack() as stack:
-        robot: BridgeRobot | None = None
-        camera: AnyCamera | None = None
-
-        def check_robot() -> str:
-            nonlocal robot
-            connecting = BridgeRobot(config.robot.bridge)
-            connecting.connect()
-            robot = connecting
-            stack.callback(robot.close)
-            return f"answers at {robot.config.host}"
-
-        def check_camera() -> str:
-            nonlocal camera
-            camera = open_camera(config.robot.camera)
-            stack.callback(camera.close)
-            return "answers"
-
-        yield "robot", check_robot
-        yield "camera", check_camera
-        measured = measure(robot, camera, LISTEN_S)
-        now = time.monotonic_ns()
-        if robot is not None:
-            yield from _robot_results(robot, measured, robot.arrivals.stats(now, LISTEN_S), limits)
-        if camera is not None:
-            images, gap_ms = camera.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
-            yield "images", lambda: check_message_rate(images, IMAGE_HZ, gap_ms)
-            max_ms = config.env.delay.image_age[1] * 1e3
-            yield "image age", lambda: image_age(measured.image_ages_ms, max_ms)
-
-
-def _robot_results(
-    robot: BridgeRobot, measured: Measurements, states: ArrivalStats, limits: Limits
-) -> Iterator[Check]:
-    """Checks of the robot's messages; none if no state was received."""
-    reading = measured.reading
-    if reading is None:
-        return
-
-    def check_publishers() -> str:
-        if robot.refusal:
-            raise EnvironmentFailure(robot.refusal)
-        return "none detected"
-
-    mode = f"mode machine {reading.mode}: 29 joints, waist free"
-    yield "mode", lambda: robot.warning or mode
-    yield "joints", lambda: joint_offsets(reading.joint_position)
-    yield "posture", lambda: check_posture(reading)
-    yield "motors", lambda: motors(measured)
-    gap_ms = limits.state_hold_s * 1e3
-    yield "states", lambda: check_message_rate(states, STATE_HZ, gap_ms)
-    yield "other publishers", check_publishers
 
 
 def measure(robot: BridgeRobot | None, camera: AnyCamera | None, seconds: float) -> Measurements:
@@ -260,8 +229,7 @@ def check_posture(reading: LowState) -> str:
 
 def motors(measured: Measurements) -> str:
     """The hottest motor, and the checks that are off."""
-    if measured.refusal:
-        raise EnvironmentFailure(measured.refusal)
+    refused(measured.refusal)
     readings = None if measured.reading is None else measured.reading.motors
     joint = "" if readings is None else hottest(readings)
     finding = f"the hottest is {joint}" if joint else "no temperatures are reported"

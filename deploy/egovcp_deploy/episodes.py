@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
@@ -19,20 +19,23 @@ from numpy.typing import NDArray
 from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
 from egovcp.hardware import available_cores
-from egovcp.plan import blank_observation
+from egovcp.log.picture import AHEAD, PictureSink
+from egovcp.log.tick import RunInfo, Sink, Tick
+from egovcp.plan import Policy, PolicyStep, blank_observation
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
+from egovcp.rate import NS_PER_S
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
-from egovcp.sim.base_env import BaseVectorEnv
+from egovcp.sim.base_env import BaseVectorEnv, Observation
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import PPO, ReferencePolicy, reference
-from egovcp_deploy.options import PLANNER
+from egovcp_deploy.options import PLANNER, video_paths
 from egovcp_deploy.pilot.pilot import SafetyFilter
 from egovcp_deploy.pilot.planner import RolloutPolicy
+from egovcp_deploy.robots.sim import true_poses
 from egovcp_deploy.scores import EpisodeScore
-from egovcp_deploy.videos import VideoRecorder
 
 _POLL_S: Final = 0.2
 
@@ -77,27 +80,25 @@ class EpisodePlayer:
         if size not in self._envs:
             self._envs[size] = make_env(self._setup.env, size, [task])
         env = self._envs[size]
-        recorder = VideoRecorder(group.videos)
-        return play(env, self._policy(group, env), group.scenarios, stopped, recorder)
+        return play(env, self._policy(group, env), group.scenarios, stopped, group.videos)
 
     def _policy(self, group: EpisodeGroup, env: BaseVectorEnv) -> RolloutPolicy:
+        setup, robots = self._setup, env.num_envs
         if group.controller not in (PPO, PLANNER):
-            policy = reference(group.controller, group.action)
-            return ReferencePolicy(policy, env, lambda: group.scenarios)
-        key = group.controller, env.num_envs
+            scripted = reference(group.controller, group.action)
+            return ReferencePolicy(scripted, env, lambda: group.scenarios)
+        key = group.controller, robots
         if key not in self._policies:
-            learned = self._policies[key] = self._learned(*key)
+            learned: RolloutPolicy
+            if group.controller == PPO:
+                learned = ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
+            else:
+                self._artifact = self._artifact or load_policy(setup.policy, setup.planner)
+                learned = self._artifact.make_policy(robots, setup.seed)
             for _ in range(2):  # the first calls compile and allocate, and must not be timed
-                learned.act(*blank_observation(env.num_envs, env.robot))
+                learned.act(*blank_observation(robots, env.robot))
+            self._policies[key] = learned
         return self._policies[key]
-
-    def _learned(self, controller: str, robots: int) -> RolloutPolicy:
-        setup = self._setup
-        if controller == PPO:
-            return ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
-        if self._artifact is None:
-            self._artifact = load_policy(setup.policy, setup.planner)
-        return self._artifact.make_policy(robots, setup.seed)
 
 
 def play(
@@ -105,11 +106,12 @@ def play(
     policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
     stopped: Callable[[], bool] = lambda: False,
-    recorder: VideoRecorder | None = None,
+    videos: Sequence[Path] = (),
 ) -> list[EpisodeScore]:
     """Play one episode on each instance of ``env``; returns the scores of the episodes that ended.
 
-    Unless ``stopped()`` becomes true, these are all, and ``recorder`` draws its videos.
+    Unless ``stopped()`` becomes true, these are all, and the first ones are drawn as ``videos``,
+    whose paths have no suffix.
     """
     observation = env.reset(scenarios)
     policy.reset()
@@ -120,6 +122,9 @@ def play(
     success: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
     terminated: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
     parts: tuple[dict[str, bool], ...] = ({},) * num_envs
+    sinks = [PictureSink(*video_paths(stem)) for stem in videos]
+    for sink in sinks:
+        sink.open(RunInfo("", robot=env.robot))
     while not env.done.all() and not stopped():
         live = ~env.done
         begin = time.perf_counter()
@@ -127,16 +132,17 @@ def play(
         plan_ms.append((time.perf_counter() - begin) * 1e3 / num_envs)
         if step.skipped.size:
             skipped += live & step.skipped
-        if recorder is not None:
-            recorder.add(env, observation, policy, step)
+        if live[: len(sinks)].any():
+            _draw(sinks, len(plan_ms) - 1, env, observation, policy, step)
         result = env.step(safety.filter(step.action))
         policy.advance(result.sent_action)
         rewards += np.where(live, result.reward, 0.0)
         steps += live
         success, terminated, parts = result.success, result.terminated, result.parts
         observation = result.observation
-    if recorder is not None and env.done.all():
-        recorder.write()
+    if env.done.all():
+        for sink in sinks:
+            sink.close()
     return [
         EpisodeScore(
             episode=scenario.episode,
@@ -153,6 +159,36 @@ def play(
     ]
 
 
+def _draw(
+    sinks: Sequence[Sink],
+    index: int,
+    env: BaseVectorEnv,
+    observation: Observation,
+    policy: RolloutPolicy,
+    step: PolicyStep,
+) -> None:
+    """Add tick ``index`` of the first instances, with what the model imagines, to their ``sinks``;
+    call it before ``env`` advances."""
+    imagined = policy.imagine(step.plan, AHEAD) if isinstance(policy, Policy) else None
+    for i, sink in enumerate(sinks):
+        if env.done[i]:
+            continue
+        base, scene = true_poses(env, i)
+        sink.write(
+            Tick(
+                index=index,
+                time_ns=index * NS_PER_S // env.robot.planner_hz,
+                depth=observation.depth[i].copy(),
+                state=observation.state[i].copy(),
+                action_planned=step.action[i],
+                action_sent=step.action[i],
+                base=base,
+                scene=scene,
+                depth_imagined=None if imagined is None else imagined[i],
+            )
+        )
+
+
 class EpisodePool:
     """Plays groups in worker processes that last until `close`. ``num_workers`` 1 plays in this
     process, with ``artifact`` if it is loaded already; 0 starts one worker per processor core. Once
@@ -167,9 +203,12 @@ class EpisodePool:
     ) -> None:
         self._workers = num_workers or available_cores()
         self._player = EpisodePlayer(setup, artifact)
-        self._setup = setup
         self._stopped = stopped
-        self._executor: ProcessPoolExecutor | None = None
+        context = multiprocessing.get_context("spawn")
+        self._stop = context.Event()
+        self._executor = ProcessPoolExecutor(  # starts no process before the first `submit`
+            self._workers, context, initializer=_start, initargs=(setup, self._stop)
+        )
 
     def play(self, groups: Sequence[EpisodeGroup]) -> Iterator[tuple[int, list[EpisodeScore]]]:
         """Play ``groups``; yields (index of a group, its scores) as they finish. When stopped, it
@@ -177,12 +216,11 @@ class EpisodePool:
         killed."""
         if self._workers == 1:
             for i, group in enumerate(groups):
-                if self._stopped():
-                    return
                 yield i, self._player.play(group, self._stopped)
             return
         try:
-            index = self._submit(groups)
+            with inherited_by_workers():
+                index = {self._executor.submit(_play, group): i for i, group in enumerate(groups)}
             waiting = set(index)
             while waiting:
                 if self._stopped() and not self._stop.is_set():
@@ -196,23 +234,10 @@ class EpisodePool:
                 "a worker process was killed (out of memory?); try fewer --num_workers"
             ) from error
 
-    def _submit(self, groups: Sequence[EpisodeGroup]) -> dict[Future[list[EpisodeScore]], int]:
-        with inherited_by_workers():
-            if self._executor is None:
-                context = multiprocessing.get_context("spawn")
-                self._stop = context.Event()
-                self._executor = ProcessPoolExecutor(
-                    self._workers, context, initializer=_start, initargs=(self._setup, self._stop)
-                )
-            executor = self._executor
-            return {executor.submit(_play, group): i for i, group in enumerate(groups)}
-
     def close(self) -> None:
         """Abandon episodes in progress and end the workers."""
-        if self._executor is not None:
-            self._stop.set()
-            self._executor.shutdown(wait=True, cancel_futures=True)
-            self._executor = None
+        self._stop.set()
+        self._executor.shutdown(wait=True, cancel_futures=True)
 
 
 class _Worker:  # the state of a worker process

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import batched
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from tqdm import tqdm
 
 from egovcp.bounds import MAX_PER_CORE, bounded
@@ -46,7 +47,7 @@ from egovcp_deploy.options import (
     versions,
 )
 from egovcp_deploy.pilot.planner import backend_of
-from egovcp_deploy.scores import EpisodeScore, success_rate, summary, table
+from egovcp_deploy.scores import EpisodeScore, summary, table
 
 PROG: Final = "egovcp-eval"
 _EPILOG: Final = (
@@ -189,10 +190,23 @@ def evaluate(config: EvalConfig) -> None:
             if received:
                 raise KeyboardInterrupt
     finally:
-        if played := _sorted_scores(scores):
+        counts = {
+            f"{task} {name}": len(scores[task][name]) for task in scores for name in scores[task]
+        }
+        if any(counts.values()):
+            played = {
+                task: {
+                    name: sorted(each, key=lambda score: score.episode)
+                    for name, each in row.items()
+                    if each
+                }
+                for task, row in scores.items()
+                if any(row.values())
+            }
+            complete = min(counts.values()) == config.episodes
             record = {
                 "backend": backend,
-                "complete": not _missing(config, played),
+                "complete": complete,
                 "config": encoded(config, "policy.path", "constant.path", "ppo.path", "output_dir"),
                 "artifact": artifact.manifest if artifact else None,
                 "ppo": dict(ppo.provenance) if ppo else None,
@@ -206,47 +220,20 @@ def evaluate(config: EvalConfig) -> None:
                     for task, row in played.items()
                 },
             }
-            _report(folder, config, record, played)
-
-
-def _sorted_scores(scores: Scores) -> Scores:
-    """The scores in the order of the scenarios, without tasks and controllers without episodes."""
-    rows = {
-        task: {
-            name: sorted(played, key=lambda score: score.episode)
-            for name, played in row.items()
-            if played
-        }
-        for task, row in scores.items()
-    }
-    return {task: row for task, row in rows.items() if row}
-
-
-def _missing(config: EvalConfig, scores: Scores) -> list[str]:
-    """``[ball hold 0 of 80, ...]``: what each controller has played, if episodes are missing."""
-    counts = {
-        f"{task} {name}": len(scores.get(task, {}).get(name, ()))
-        for task in config.tasks
-        for name in config.controller_names
-    }
-    if all(count == config.episodes for count in counts.values()):
-        return []
-    return [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
-
-
-def _report(folder: Path, config: EvalConfig, record: Mapping[str, Any], scores: Scores) -> None:
-    """Write the files and print the table."""
-    figures = summary(scores, config.episodes)
-    write_json(folder / "eval_run.json", record)
-    write_json(folder / "eval.json", figures)
-    echo(table(figures))
-    if backend := record["backend"]:
-        echo(f"plans computed by {backend}")
-    if skipped := sum(s.skipped for row in scores.values() for each in row.values() for s in each):
-        echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
-    if missing := _missing(config, scores):
-        echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
-    echo(f"figures: {folder / 'eval.json'}")
+            figures = summary(played, config.episodes)
+            write_json(folder / "eval_run.json", record)
+            write_json(folder / "eval.json", figures)
+            echo(table(figures))
+            if backend:
+                echo(f"plans computed by {backend}")
+            if skipped := sum(
+                s.skipped for row in played.values() for e in row.values() for s in e
+            ):
+                echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
+            if not complete:
+                missing = [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
+                echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
+            echo(f"figures: {folder / 'eval.json'}")
 
 
 def _find_constants(
@@ -286,25 +273,8 @@ def _run_episodes(
     folder: Path,
 ) -> None:
     """Play every controller on every task, and add the scores to ``scores``; videos go to
-    ``folder``."""
-    groups = list(_groups(config, constants, folder))
-    total = sum(len(group.scenarios) for group in groups)
-    with tqdm(total=total, unit="ep", desc="evaluate") as bar:
-        for i, part in pool.play(groups):
-            group = groups[i]
-            scores[group.scenarios[0].task][group.controller] += part
-            rates = []
-            for name in config.controller_names:
-                if played := [score for row in scores.values() for score in row[name]]:
-                    rates.append(f"{name} {success_rate(played):.0%}")
-            bar.set_postfix_str(", ".join(rates), refresh=False)
-            bar.update(len(part))
-
-
-def _groups(
-    config: EvalConfig, constants: dict[str, BestConstant], folder: Path
-) -> Iterator[EpisodeGroup]:
-    """The planner's groups first, since they take longest."""
+    ``folder``. The planner's groups are the first, since they take longest."""
+    groups = []
     for name in sorted(config.controller_names, key=lambda name: name != PLANNER):
         for task in config.tasks:
             scenarios = [held_out(task, config.seed, i) for i in range(config.episodes)]
@@ -312,7 +282,18 @@ def _groups(
                 action = constants[task].action if name == CONSTANT else ()
                 stems = [folder / f"rollout-{task}-{name}-{s.episode}" for s in part]
                 videos = tuple(stems[: max(0, config.videos - part[0].episode)])
-                yield EpisodeGroup(name, part, action, videos)
+                groups.append(EpisodeGroup(name, part, action, videos))
+    total = config.episodes * len(config.controller_names) * len(config.tasks)
+    with tqdm(total=total, unit="ep", desc="evaluate") as bar:
+        for i, played in pool.play(groups):
+            scores[groups[i].scenarios[0].task][groups[i].controller] += played
+            successes = {
+                name: [score.success for row in scores.values() for score in row[name]]
+                for name in config.controller_names
+            }
+            rates = [f"{name} {np.mean(each):.0%}" for name, each in successes.items() if each]
+            bar.set_postfix_str(", ".join(rates), refresh=False)
+            bar.update(len(played))
 
 
 def _score_json(score: EpisodeScore) -> dict[str, Any]:

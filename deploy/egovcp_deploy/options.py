@@ -29,11 +29,6 @@ def held_out(task: str, seed: int, episode: int) -> Scenario:
     return Scenario(task, HELD_OUT + seed, episode)
 
 
-def for_search(task: str, seed: int, episode: int) -> Scenario:
-    """Scenario ``episode`` of the search for the best constant action; see `held_out`."""
-    return Scenario(task, SEARCH + seed, episode)
-
-
 def check_output_dir(path: str) -> Path:
     """The folder of ``--output_dir``, which must be new or empty; it is not created. Raises
     `UsageError` if none is named or it holds files, `EnvironmentFailure` if it is not writable."""

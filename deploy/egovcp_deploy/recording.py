@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,15 +14,16 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
-from egovcp.log.tick import CameraView, Fanout, RunInfo, Sink
+from egovcp.log.tick import Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
-from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo
 from egovcp_deploy.options import versions, video_paths
 
 if TYPE_CHECKING:
     from egovcp.log.viewer import Viewer
     from egovcp_deploy.config import DeployConfig
+
+_CONTROLLER: Final = "low_level_controller"  # key of its identity
 
 
 @dataclass(frozen=True)
@@ -55,29 +56,32 @@ def open_viewer(options: LogOptions) -> Iterator[Viewer | None]:
 
 @contextmanager
 def recording(
-    folder: Path,
-    episode: int,
-    info: RunInfo,
-    options: LogOptions,
-    viewer: Viewer | None,
-    blocking: bool,
+    folder: Path, info: RunInfo, options: LogOptions, viewer: Viewer | None, blocking: bool
 ) -> Iterator[Sink]:
-    """Sinks of rollout number ``episode``. If ``blocking``, the loop may wait for the disk, as in
-    simulated time; else each sink, like any viewer, runs in a separate process."""
-    with ExitStack() as stack:
-        files = _file_sinks(folder / f"rollout-{episode}", episode, options)
-        viewers = list[AsyncSink]()
-        if viewer is not None:
-            from egovcp.log.rerun import RerunSink
+    """Sinks of rollout number ``info.episode``. If ``blocking``, the loop may wait for the disk, as
+    in simulated time; else each sink, like any viewer, runs in a separate process."""
+    stem = folder / f"rollout-{info.episode}"
+    mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
+    files: dict[str, Sink] = {mcap.name: McapSink(mcap)}
+    if options.rrd:
+        from egovcp.log.rerun import RerunSink
 
-            viewers.append(AsyncSink(RerunSink(viewer), "Rerun"))
-        sink: Sink
-        if blocking:
-            sink = Fanout([*files.values(), *viewers])
-        else:
-            writers = [AsyncSink(file, name) for name, file in files.items()]
-            sink = AsyncFanout([*writers, *viewers])
-        stack.callback(sink.close)
+        files[rrd.name] = RerunSink(rrd)
+    if info.episode < options.videos and is_installed("matplotlib"):
+        from egovcp.log.picture import PictureSink
+
+        files[f"{stem.name}.gif"] = PictureSink(stem.with_suffix(".png"), *video_paths(stem))
+    viewers = list[AsyncSink]()
+    if viewer is not None:
+        from egovcp.log.rerun import RerunSink
+
+        viewers.append(AsyncSink(RerunSink(viewer), "Rerun"))
+    sink: Sink
+    if blocking:
+        sink = Fanout([*files.values(), *viewers])
+    else:
+        sink = AsyncFanout([*(AsyncSink(file, name) for name, file in files.items()), *viewers])
+    with closing(sink):
         sink.open(info)
         yield sink
 
@@ -88,43 +92,18 @@ def missing_ticks(sink: Sink) -> dict[str, int]:
     return {each.name: each.dropped + each.lost for each in sinks}
 
 
-def _file_sinks(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
-    """File name -> its sink."""
-    mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
-    sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
-    if options.rrd:
-        from egovcp.log.rerun import RerunSink
-
-        sinks[rrd.name] = RerunSink(rrd)
-    if episode < options.videos and is_installed("matplotlib"):
-        from egovcp.log.picture import PictureSink
-
-        sinks[f"{stem.name}.gif"] = PictureSink(stem.with_suffix(".png"), *video_paths(stem))
-    return sinks
-
-
 def run_info(
-    config: DeployConfig,
-    controller_id: str,
-    artifact: Artifact | None,
-    backend: str,
-    episode: int = 0,
-    camera: CameraView | None = None,
-    robot: RobotSpec = G1,
+    config: DeployConfig, controller_id: str, artifact: Artifact | None, backend: str
 ) -> RunInfo:
-    """The first record of a log; ``backend`` see `backend_of`."""
+    """The first record of the log of a G1's rollout 0; ``backend`` see `backend_of`."""
     files = artifact.manifest["files"] if artifact else {}
     return RunInfo(
         task=config.task,
         seed=config.seed,
-        episode=episode,
-        camera=camera or CameraView(),
         config=config.encoded(),
-        hashes={"low_level_controller": controller_id, **files},
+        hashes={_CONTROLLER: controller_id, **files},
         versions=versions(),
         backend=backend,
-        fps=robot.planner_hz,
-        robot=robot,
     )
 
 
@@ -134,14 +113,13 @@ def percentiles(name: str, values: list[float]) -> dict[str, float]:
     return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
-def provenance(
-    config: DeployConfig, controller_id: str, artifact: Artifact | None, backend: str
-) -> dict[str, Any]:
+def provenance(info: RunInfo) -> dict[str, Any]:
     """The part of ``deploy.json`` that says what produced the results."""
+    files = {name: value for name, value in info.hashes.items() if name != _CONTROLLER}
     return {
-        "config": config.encoded(),
-        "artifact": artifact.manifest["files"] if artifact else None,
-        "low_level_controller": controller_id,
-        "backend": backend,
-        "versions": versions(),
+        "config": info.config,
+        "artifact": files or None,  # None: no artifact
+        _CONTROLLER: info.hashes[_CONTROLLER],
+        "backend": info.backend,
+        "versions": info.versions,
     }

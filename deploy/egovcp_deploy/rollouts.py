@@ -8,8 +8,9 @@ With o_{t+1} the planner receives the action that was sent, and advances its rec
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +28,6 @@ from egovcp_deploy.pilot.pilot import REJECTED, Pilot
 from egovcp_deploy.pilot.planner import (
     SKIPPED,
     InlinePlanner,
-    PlanMessage,
     PlannerClient,
     PlannerRunner,
     RolloutPolicy,
@@ -36,7 +36,6 @@ from egovcp_deploy.pilot.planner import (
 )
 from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State
 from egovcp_deploy.recording import open_viewer, percentiles, provenance, recording, run_info
-from egovcp_deploy.robots.base import RobotObservation
 from egovcp_deploy.robots.replay import ReplayRobot, open_recordings
 
 if TYPE_CHECKING:
@@ -59,11 +58,11 @@ class RolloutSummary:
     damped: str = ""  # why the motors were damped; empty: they were not
     plan_ms: list[float] = field(default_factory=list)  # time to filter and plan, per plan
 
-    def add(self, tick: Tick) -> None:
+    def add(self, tick: Tick, parts: Mapping[str, bool]) -> None:
         """Add one step."""
         self.steps += 1
         self.reward += tick.reward
-        self.success = tick.success
+        self.success, self.parts = tick.success, parts
         self.terminated, self.truncated = tick.terminated, tick.truncated
         self.rejected += REJECTED in tick.events
         self.skipped += tick.events.count(SKIPPED)
@@ -72,57 +71,51 @@ class RolloutSummary:
             self.plan_ms.append(tick.timing_ms["plan"])
 
 
-class LockstepRunner:
-    """Drives one robot with one planner in simulated time, until the robot ends the rollout."""
-
-    def __init__(
-        self, planner: PlannerClient, robot: SimRobot | ReplayRobot, limits: Limits | None = None
-    ) -> None:
-        self._planner, self._robot, self._limits = planner, robot, limits
-
-    def run(
-        self, sink: Sink, on_tick: Callable[[Tick], None] = lambda tick: None
-    ) -> RolloutSummary:
-        """Play the episode that the robot has started; ``sink`` is open."""
-        self._period_ns = NS_PER_S // self._robot.spec.planner_hz
-        self._pilot = Pilot(self._planner, self._limits, State.ARMED, self._robot.spec)
-        summary = RolloutSummary()
-        while not (summary.terminated or summary.truncated):
-            tick = self._tick(summary.steps)
-            sink.write(tick)
-            summary.add(tick)
-            summary.parts = self._parts
-            on_tick(tick)
-        if self._pilot.supervisor.state is State.DAMP:
-            summary.damped = self._pilot.supervisor.reason
-        return summary
-
-    def _tick(self, index: int) -> Tick:
+def run_rollout(
+    planner: PlannerClient,
+    robot: SimRobot | ReplayRobot,
+    sink: Sink,
+    limits: Limits | None = None,
+    on_tick: Callable[[Tick], None] = lambda tick: None,
+) -> RolloutSummary:
+    """Drive ``robot``, which has started an episode, in simulated time until it ends the rollout;
+    ``sink`` is open."""
+    period_ns = NS_PER_S // robot.spec.planner_hz
+    pilot = Pilot(planner, limits, State.ARMED, robot.spec)
+    summary = RolloutSummary()
+    while not (summary.terminated or summary.truncated):
+        index, now = summary.steps, summary.steps * period_ns
         begin = time.perf_counter()
-        sensed = self._robot.observe()
+        sensed = robot.observe()
         observed = time.perf_counter()
-        plan = self._plan(index, sensed)
+        pilot.sense(now, sensed.state, sensed.depth)
+        before = pilot.supervisor.state
+        state = pilot.update_state(Facts(now), OperatorRequest.RUN if index == 0 else None)
+        if index == 0 and state is State.RUN:
+            pilot.take_events()  # every simulated rollout starts in RUN: not worth a log line
+        if state is State.DAMP and before is not State.DAMP:
+            robot.damp()
+        pilot.send_observation(now, sensed.depth, sensed.state)
+        plan = pilot.receive_plans(now + period_ns)
         planned = time.perf_counter()
-        wanted = self._pilot.next_action()
-        outcome = self._robot.act(wanted)
-        self._pilot.sent, self._parts = outcome.sent, outcome.parts
-        ended = time.perf_counter()
-        timing = {
-            "observe": observed - begin,
-            "think": planned - observed,
-            "robot": ended - planned,
+        wanted = pilot.next_action()
+        outcome = robot.act(wanted)
+        pilot.sent = outcome.sent
+        timing_ms = {
+            "observe": 1e3 * (observed - begin),
+            "think": 1e3 * (planned - observed),
+            "robot": 1e3 * (time.perf_counter() - planned),
         }
-        timing_ms = {name: 1e3 * seconds for name, seconds in timing.items()}
         if plan is not None:
             timing_ms["plan"] = plan.plan_ms
-        return Tick(
+        tick = Tick(
             index=index,
-            time_ns=index * self._period_ns,
+            time_ns=now,
             depth=sensed.depth,
             state=sensed.state,
             action_planned=wanted if plan is None else plan.step.action[0],
             action_sent=outcome.sent,
-            mode=self._pilot.supervisor.state,
+            mode=pilot.supervisor.state,
             reward=outcome.reward,
             reward_terms=outcome.reward_terms,
             terminated=outcome.terminated,
@@ -130,23 +123,16 @@ class LockstepRunner:
             success=outcome.success,
             base=sensed.base,
             scene=sensed.scene,
-            events=(*self._pilot.take_events(), *outcome.events),
+            events=(*pilot.take_events(), *outcome.events),
             timing_ms=timing_ms,
-            **planner_fields(plan, self._robot.spec),
+            **planner_fields(plan, robot.spec),
         )
-
-    def _plan(self, index: int, sensed: RobotObservation) -> PlanMessage | None:
-        """Update the state machine and plan; None: no plan within the step."""
-        pilot, now = self._pilot, index * self._period_ns
-        pilot.sense(now, sensed.state, sensed.depth)
-        before = pilot.supervisor.state
-        state = pilot.update_state(Facts(now), OperatorRequest.RUN if index == 0 else None)
-        if index == 0 and state is State.RUN:
-            pilot.take_events()  # every simulated rollout starts in RUN: not worth a log line
-        if state is State.DAMP and before is not State.DAMP:
-            self._robot.damp()
-        pilot.send_observation(now, sensed.depth, sensed.state)
-        return pilot.receive_plans(now + self._period_ns)
+        sink.write(tick)
+        summary.add(tick, outcome.parts)
+        on_tick(tick)
+    if pilot.supervisor.state is State.DAMP:
+        summary.damped = pilot.supervisor.reason
+    return summary
 
 
 def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
@@ -187,12 +173,12 @@ def _play(
     robot: SimRobot | ReplayRobot,
     policy: RolloutPolicy,
 ) -> Path:
-    planner = PlannerRunner(policy, config.imagine)
+    runner = PlannerRunner(policy, config.imagine)
     if artifact is not None:
-        planner.warm_up()
+        runner.warm_up()
+    planner = InlinePlanner(runner)
     folder = make_output_dir(config.output_dir)
     backend = backend_of(policy)
-    runner = LockstepRunner(InlinePlanner(planner), robot, config.robot.limits)
     summaries: list[RolloutSummary] = []
     try:
         with (
@@ -201,17 +187,17 @@ def _play(
         ):
             for episode in range(config.episodes):
                 robot.start(episode)
-                info = run_info(
-                    config,
-                    robot.controller_id,
-                    artifact,
-                    backend,
-                    episode,
-                    robot.camera,
-                    robot.spec,
+                info = replace(
+                    run_info(config, robot.controller_id, artifact, backend),
+                    episode=episode,
+                    camera=robot.camera,
+                    robot=robot.spec,
+                    fps=robot.spec.planner_hz,
                 )
-                with recording(folder, episode, info, config.log, viewer, blocking=True) as sink:
-                    summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
+                with recording(folder, info, config.log, viewer, blocking=True) as sink:
+                    summaries.append(
+                        run_rollout(planner, robot, sink, config.robot.limits, partial(_show, bar))
+                    )
                 bar.update(1)
     finally:
         if summaries:
@@ -220,10 +206,21 @@ def _play(
                 "seed": config.seed,
                 "success_rate": float(np.mean([summary.success for summary in summaries])),
                 "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
-                **provenance(config, robot.controller_id, artifact, backend),
+                **provenance(info),
             }
             write_json(folder / "deploy.json", report)
-            _print(summaries)
+            for i, summary in enumerate(summaries):
+                verdict = (
+                    "success" if summary.success else "fell" if summary.terminated else "failure"
+                )
+                skipped = f", {summary.skipped} observations skipped" if summary.skipped else ""
+                echo(
+                    f"rollout {i}: {verdict}, {summary.steps} steps, "
+                    f"mean reward {summary.reward / summary.steps:+.4f}, "
+                    f"plan {np.median(summary.plan_ms):.0f} ms{skipped}"
+                )
+                for name, success in summary.parts.items():
+                    echo(f"  {name}: {'success' if success else 'failure'}")
     return folder
 
 
@@ -249,16 +246,3 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "mcap": f"rollout-{episode}.mcap",
         "rrd": f"rollout-{episode}.rrd",
     }
-
-
-def _print(summaries: Sequence[RolloutSummary]) -> None:
-    for i, summary in enumerate(summaries):
-        verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
-        echo(
-            f"rollout {i}: {verdict}, {summary.steps} steps, "
-            f"mean reward {summary.reward / summary.steps:+.4f}, "
-            f"plan {np.median(summary.plan_ms):.0f} ms"
-            + (f", {summary.skipped} observations skipped" if summary.skipped else "")
-        )
-        for name, success in summary.parts.items():
-            echo(f"  {name}: {'success' if success else 'failure'}")

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.eval_scores import EvalScores, wilson
+from egovcp.eval_scores import EvalScores, signed_range, wilson
 from egovcp.terminal import one_line
 
 #: Task -> controller -> episodes.
@@ -26,11 +26,9 @@ class EpisodeScore:
     reward: float  # sum over the episode
     success: bool
     terminated: bool
-    plan_ms: list[float] = field(default_factory=list)
-    """Time per step to compute an action, ms; for robots planned together, per robot."""
+    plan_ms: list[float] = field(default_factory=list)  # per step; of robots together: per robot
     skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
-    parts: dict[str, bool] = field(default_factory=dict)
-    """Success of each part of a sequence of tasks; empty for a single task."""
+    parts: dict[str, bool] = field(default_factory=dict)  # success of each part of a sequence
 
 
 def paired(
@@ -40,11 +38,6 @@ def paired(
     a, b = ({score.episode: score for score in each} for each in (scores, others))
     common = sorted(a.keys() & b.keys())
     return [a[i] for i in common], [b[i] for i in common]
-
-
-def success_rate(scores: Sequence[EpisodeScore]) -> float:
-    """Share of successful episodes."""
-    return sum(score.success for score in scores) / len(scores)
 
 
 def eval_scores(scores: Sequence[EpisodeScore]) -> EvalScores:
@@ -96,14 +89,13 @@ def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     lines: list[tuple[str, ...]] = [_HEAD]
     for task, row in figures.items():
         for name, f in row.items():
-            low, high = f["reward_ci95"]
             lines.append(
                 (
                     task,
                     name,
                     *_success_cells(f),
                     f"{f['reward_mean']:+.5f}",
-                    f"{low:+.5f} to {high:+.5f}",
+                    signed_range(f["reward_ci95"]),
                     f"{f['plan_ms_p50']:.2f}",
                     f"{f['plan_ms_p99']:.2f}",
                 )

@@ -18,6 +18,7 @@ from egovcp.sim.tasks.registry import find_task, name_problem, register_task, ta
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
 from egovcp_deploy.options import SEEDS, make_output_dir
+from egovcp_deploy.scores import aligned
 
 COMMANDS: Final = CommandGroup(
     "egovcp-task",
@@ -53,14 +54,11 @@ class ListConfig:
 def run_list(config: ListConfig) -> None:
     """Print one line per task."""
     require_packages("egovcp-deploy", "egovcp-task", *SIMULATOR_MODULES)
-    entries = task_entries()
     rows = [
         (entry.name, entry.origin, entry.task.description if entry.task else f"! {entry.problem}")
-        for entry in entries
+        for entry in task_entries()
     ]
-    widths = [max(len(row[i]) for row in rows) for i in range(2)] if rows else [0, 0]
-    for name, origin, about in rows:
-        echo(f"{name:{widths[0]}}  {origin:{widths[1]}}  {about}")
+    echo(aligned(rows, text_columns=3))
 
 
 @dataclass(frozen=True)
@@ -90,10 +88,11 @@ def run_check(config: CheckTaskConfig) -> None:
         raise EnvironmentFailure(f"{error}; repair the class of the task") from error
     write_report(config.json, asdict(report))
     terms = list(next(iter(report.reward.values())))
-    echo(f"{'':8}{'success':>8}{''.join(f'{term:>13}' for term in terms)}")
+    rows = [("", "success", *terms)]
     for name in (name for name in _CONTROLLERS if name in report.reward):
-        sums = "".join(f"{report.reward[name][term]:+13.3f}" for term in terms)
-        echo(f"{name:8}{report.success_rate[name]:8.0%}{sums}")
+        sums = (f"{report.reward[name][term]:+.3f}" for term in terms)
+        rows.append((name, f"{report.success_rate[name]:.0%}", *sums))
+    echo(aligned(rows, text_columns=1))
     oracle = "" if "oracle" in report.reward else "; it has no oracle"
     echo(f"{report.task} conforms: {report.ms_per_step:.1f} ms per robot and step{oracle}")
 

@@ -20,7 +20,7 @@ from egovcp_deploy.pilot.planner import PlannerRunner
 from egovcp_deploy.pilot.states import Facts, OperatorRequest, State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 from egovcp_deploy.robots.sim import SimRobot
-from egovcp_deploy.rollouts import LockstepRunner
+from egovcp_deploy.rollouts import run_rollout
 from tests.support.lockstep import DelayedPlanner
 from tests.support.sinks import MemorySink
 
@@ -129,7 +129,7 @@ def play(
 
     robot.start(0)
     with mock.patch.object(Pilot, "update_state", operated):
-        LockstepRunner(planner, robot).run(memory)
+        run_rollout(planner, robot, memory)
     return memory.ticks, robot
 
 

@@ -14,7 +14,7 @@ from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.pilot.planner import LOGGED_CANDIDATES, InlinePlanner, PlannerRunner
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
-from egovcp_deploy.rollouts import LockstepRunner
+from egovcp_deploy.rollouts import RolloutSummary, run_rollout
 from tests.support.sinks import MemorySink
 
 
@@ -104,13 +104,15 @@ class FakeRobot:
         pass
 
 
-def runner(policy: PlainPolicy, robot: FakeRobot, imagine: int = 16) -> LockstepRunner:
-    return LockstepRunner(InlinePlanner(PlannerRunner(policy, imagine)), robot)
+def play(
+    policy: PlainPolicy, robot: FakeRobot, sink: MemorySink, imagine: int = 16
+) -> RolloutSummary:
+    return run_rollout(InlinePlanner(PlannerRunner(policy, imagine)), robot, sink)
 
 
 def test_a_tick_holds_observation_action_and_outcome() -> None:
     policy, robot, memory = FakePolicy([0.1, 0.2, 0.3, 0.2, 0.1]), FakeRobot(), MemorySink()
-    summary = runner(policy, robot, imagine=3).run(memory)
+    summary = play(policy, robot, memory, imagine=3)
     assert [tick.index for tick in memory.ticks] == [0, 1, 2, 3, 4]
     assert [tick.time_ns for tick in memory.ticks] == [40_000_000 * k for k in range(5)]
     assert [int(tick.depth[0, 0]) for tick in memory.ticks] == [1000, 1001, 1002, 1003, 1004]
@@ -129,7 +131,7 @@ def test_a_tick_holds_observation_action_and_outcome() -> None:
 
 def test_the_recurrence_advances_with_the_sent_action() -> None:
     policy, memory = FakePolicy([0.3] * 5), MemorySink()
-    runner(policy, FakeRobot()).run(memory)
+    play(policy, FakeRobot(), memory)
     assert len(policy.sent) == 4  # the last action has no observation after it
     for sent, tick in zip(policy.sent, memory.ticks, strict=False):
         np.testing.assert_array_equal(sent[0], tick.action_sent)
@@ -137,7 +139,7 @@ def test_the_recurrence_advances_with_the_sent_action() -> None:
 
 def test_actions_pass_the_safety_filter_before_the_robot() -> None:
     policy, memory = FakePolicy([5.0, np.nan, 5.0, 5.0, 5.0]), MemorySink()
-    summary = runner(policy, FakeRobot()).run(memory)
+    summary = play(policy, FakeRobot(), memory)
     sent = [float(tick.action_sent[0]) * 2 for tick in memory.ticks]
     np.testing.assert_allclose(sent, [0.32, 0.64, 0.96, 1.0, 1.0])  # the plan before goes on
     assert [REJECTED in tick.events for tick in memory.ticks] == [False, True, False, False, False]
@@ -146,12 +148,11 @@ def test_actions_pass_the_safety_filter_before_the_robot() -> None:
 
 def test_every_rollout_starts_from_the_initial_state() -> None:
     policy, robot = FakePolicy([0.5] * 5), FakeRobot()
-    loop = runner(policy, robot)
     actions = []
     for episode in range(2):
         robot.start(episode)
         memory = MemorySink()
-        loop.run(memory)
+        play(policy, robot, memory)
         actions.append([tick.action_sent.tolist() for tick in memory.ticks])
         assert memory.ticks[0].time_ns == 0
     assert actions[0] == actions[1]
@@ -160,7 +161,7 @@ def test_every_rollout_starts_from_the_initial_state() -> None:
 
 def test_without_a_world_model_nothing_is_decoded() -> None:
     memory = MemorySink()
-    runner(PlainPolicy([0.1] * 5), FakeRobot(), imagine=3).run(memory)
+    play(PlainPolicy([0.1] * 5), FakeRobot(), memory, imagine=3)
     assert len(memory.ticks) == 5
     for tick in memory.ticks:
         assert tick.depth_reconstructed is None
@@ -170,7 +171,7 @@ def test_without_a_world_model_nothing_is_decoded() -> None:
 
 def test_the_best_candidates_are_logged_as_hand_paths() -> None:
     memory = MemorySink()
-    runner(FakePolicy([0.0] * 5), FakeRobot(), imagine=0).run(memory)
+    play(FakePolicy([0.0] * 5), FakeRobot(), memory, imagine=0)
     candidates = memory.ticks[0].candidates
     assert candidates is not None
     assert candidates.hands_b.shape == (LOGGED_CANDIDATES, 4, 2, 3)

@@ -20,14 +20,13 @@ from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import (
+    Array,
     DepthCamera,
-    LowLevelRobot,
     LowState,
     MotorCommand,
     proprioception,
 )
-
-Array = NDArray[np.float64]
+from egovcp_deploy.robots.bridge import BridgeRobot
 
 #: N m s/rad in DAMP: legs and waist let a standing robot sink in about a second.
 DAMPED: Final = np.concatenate([np.full(15, 8.0), np.full(NUM_JOINTS - 15, 2.0)])
@@ -55,15 +54,11 @@ def damping_command(position: NDArray[np.floating] | None, mode: int) -> MotorCo
     return MotorCommand(_bounded(where), np.zeros(NUM_JOINTS), DAMPED, mode)
 
 
-def position_command(target: Array, stiffness: Array, damping: Array, mode: int) -> MotorCommand:
-    """Full gains towards ``target`` (29,) rad."""
-    return MotorCommand(_bounded(target), stiffness, damping, mode)
-
-
 def ramp_command(
     start: Array, target: Array, stiffness: Array, damping: Array, share: float, mode: int
 ) -> MotorCommand:
-    """Ramp of the gains: at ``share`` 0 damped at ``start``, at 1 `position_command`."""
+    """Ramp of the gains: at ``share`` 0 damped at ``start`` (29,) rad, at 1 full gains towards
+    ``target`` (29,) rad."""
     share = min(max(share, 0.0), 1.0)
     position = (1 - share) * _bounded(start) + share * _bounded(target)
     return MotorCommand(position, share * stiffness, (1 - share) * DAMPED + share * damping, mode)
@@ -81,11 +76,8 @@ class VelocityCommand:
         self._last_ns: int | None = None
 
     def set_target(self, time_ns: int, velocity: NDArray[np.floating] | tuple[float, ...]) -> str:
-        """Request ``velocity`` (3,); one of another shape or not finite is ignored.
-
-        Returns:
-            A warning at the first velocity that is outside the bounds; else empty.
-        """
+        """Request ``velocity`` (3,); one of another shape or not finite is ignored. Returns a
+        warning at the first velocity that is outside the bounds; else empty."""
         target = np.asarray(velocity, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
             return ""
@@ -124,7 +116,7 @@ class ControlLoop:
 
     def __init__(
         self,
-        body: LowLevelRobot,
+        body: BridgeRobot,
         camera: DepthCamera,
         controller: LowLevelController,
         pilot: Pilot,
@@ -144,7 +136,7 @@ class ControlLoop:
         self._count = 0
         self._pending = False  # o_t has been sent, a_t is not decided
         self._reading: LowState | None = None
-        self._ramp_start: Array | None = None
+        self._ramp_start: Array = np.zeros(NUM_JOINTS)  # where STAND began
 
     @property
     def state(self) -> State:
@@ -156,7 +148,7 @@ class ControlLoop:
         reading, image = self._read(), self._camera.read()
         planner_tick = self._count % CONTROLLER_TICKS_PER_PLAN == 0
         self.pilot.receive_plans(now_ns)
-        if self._pending and (planner_tick or self.pilot.has_plan):
+        if self._pending and (planner_tick or self.pilot.plans.has(self.pilot.tick)):
             self.pilot.next_action()
             self._pending = False
         if command.velocity is not None:
@@ -185,10 +177,14 @@ class ControlLoop:
         self._count += 1
 
     def _read(self) -> LowState | None:
-        """The newest finite reading; others would corrupt the state of the controller."""
+        """The newest reading that is finite and has a rotation; others would corrupt the state of
+        the controller."""
         reading = self._body.read()
-        if reading is not None and is_finite(reading):
-            self._reading = reading
+        if reading is not None:
+            q = np.asarray(reading.quaternion_w)
+            parts = (reading.joint_position, reading.joint_velocity, reading.angular_velocity)
+            if abs(float(q @ q) - 1.0) < 0.1 and all(np.isfinite(part).all() for part in parts):
+                self._reading = reading
         return self._reading
 
     def _update_state(
@@ -223,16 +219,8 @@ class ControlLoop:
         if not np.isfinite(target).all():
             self.pilot.update_state(Facts(now_ns, controller_ok=False))
             return damping_command(position, mode)
-        gains = self._controller.stiffness, self._controller.damping
-        if self.state is State.STAND and self._ramp_start is not None:
+        gains, share = (self._controller.stiffness, self._controller.damping), 1.0
+        if self.state is State.STAND:
             supervisor = self.pilot.supervisor
             share = supervisor.time_in_state_s(now_ns) / supervisor.limits.stand_s
-            return ramp_command(self._ramp_start, target, *gains, share, mode)
-        return position_command(target, *gains, mode)
-
-
-def is_finite(reading: LowState) -> bool:
-    """Whether a reading is finite and its quaternion a rotation."""
-    q = np.asarray(reading.quaternion_w)
-    parts = (reading.joint_position, reading.joint_velocity, reading.angular_velocity)
-    return abs(float(q @ q) - 1.0) < 0.1 and all(np.isfinite(part).all() for part in parts)
+        return ramp_command(self._ramp_start, target, *gains, share, mode)

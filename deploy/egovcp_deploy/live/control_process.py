@@ -27,7 +27,7 @@ from egovcp_deploy.live.link import Link, RemotePlanner
 from egovcp_deploy.live.operators import RemoteOperator
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
-from egovcp_deploy.robots.base import LowLevelRobot
+from egovcp_deploy.robots.bridge import BridgeRobot
 
 #: Real-time priorities of threads that receive, and of the loop. The kernel's own threads have 50.
 RECEIVING: Final = 10
@@ -123,7 +123,7 @@ def merged(commands: Sequence[OperatorCommand]) -> OperatorCommand:
     return OperatorCommand(request, velocity)
 
 
-def damp_motors(body: LowLevelRobot) -> None:
+def damp_motors(body: BridgeRobot) -> None:
     """Send several damping commands, 5 ms apart."""
     clock = MonotonicClock()
     for _ in range(_DAMPING_COMMANDS):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +16,7 @@ from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, SafetyStop
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import Tick
 from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
@@ -39,38 +40,30 @@ SIMULATED_S: Final = 15.0  # in RUN: release from the gantry, settling, the epis
 
 
 def drive(config: DeployConfig, artifact: Artifact) -> None:
-    """One run of a robot, recorded as rollout 0; raises as `deploy`."""
+    """One run of a robot, or one episode of the simulated one, recorded as rollout 0; raises as
+    `deploy`."""
+    simulated = config.robot.type == "sim"
+    if simulated:
+        operator = config.operator
+        if operator.type == "auto" and not operator.duration:
+            operator = replace(operator, duration=SIMULATED_S)
+        robot = replace(config.robot, controller=config.env.controller)
+        config = replace(config, robot=robot, operator=operator)
     robot = config.robot
-    setup = ControlSetup(robot.bridge, robot.camera, robot.controller, robot.limits)
     artifact.require_controller(make_controller(robot.controller).id)
     folder = make_output_dir(config.output_dir)
-    stays = config.operator.type != "auto" or not config.operator.duration
-    _run(config, artifact, folder, setup, stays=stays, stands=True)
-
-
-def drive_simulated(config: DeployConfig, artifact: Artifact) -> None:
-    """One episode of the simulated robot on the wall clock; raises as `deploy`."""
-    operator = config.operator
-    if operator.type == "auto" and not operator.duration:
-        operator = replace(operator, duration=SIMULATED_S)
-    robot = replace(config.robot, controller=config.env.controller)
-    config = replace(config, robot=robot, operator=operator)
-    artifact.require_controller(make_controller(config.robot.controller).id)
-    folder = make_output_dir(config.output_dir)
-    with simulated_robot(config, folder / "task.json") as (bridge, camera):
+    with ExitStack() as stack:
+        bridge, camera = robot.bridge, robot.camera
+        if simulated:
+            bridge, camera = stack.enter_context(simulated_robot(config, folder / "task.json"))
         setup = ControlSetup(bridge, camera, robot.controller, robot.limits)
-        _run(config, artifact, folder, setup, stays=False, stands=False)
+        _run(config, artifact, folder, setup)
 
 
-def _run(
-    config: DeployConfig,
-    artifact: Artifact,
-    folder: Path,
-    setup: ControlSetup,
-    stays: bool,
-    stands: bool,
-) -> None:
-    """Drive, report, raise what ended the run early; ``stays``, ``stands``: see `PlannerLoop`."""
+def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: ControlSetup) -> None:
+    """Drive, report, raise what ended the run early."""
+    stands = config.robot.type != "sim"
+    stays = stands and not (config.operator.type == "auto" and config.operator.duration)
     if "OMP_NUM_THREADS" not in os.environ:
         # The control process and the logs need a core: planning threads that wait for one that was
         # preempted are slower than fewer threads.
@@ -84,7 +77,7 @@ def _run(
         with (
             open_operator(config.operator) as operator,
             open_viewer(config.log) as viewer,
-            recording(folder, 0, info, config.log, viewer, blocking=False) as sink,
+            recording(folder, info, config.log, viewer, blocking=False) as sink,
             tqdm(unit="tick", desc="live") as bar,
             running_control(setup) as control,
         ):
@@ -105,9 +98,32 @@ def _run(
         for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
             path.unlink()
         raise
-    report = _report(config, summary) | provenance(config, controller_id, artifact, info.backend)
+    report = {
+        "robot": config.robot.type,
+        "ticks": summary.ticks,
+        "ticks_running": summary.running,
+        "ticks_held": summary.held,
+        "plans": summary.planned,
+        "plans_late": summary.late,
+        "skipped_observations": summary.skipped,
+        **percentiles("plan_ms", summary.plan_ms),
+        **percentiles("latency_ms", summary.latency_ms),
+        "iterations_mean": float(np.mean(summary.iterations or [0])),
+        "missing_ticks": summary.missing_ticks,
+        "damped": summary.damped,
+        "failure": "" if summary.failure is None else describe_failure(summary.failure),
+        "events": summary.events,
+        **provenance(info),
+    }
     write_json(folder / "deploy.json", report)
-    _print(summary, info, folder)
+    latency = percentiles("ms", summary.latency_ms)
+    skipped = f"; {summary.skipped} observations skipped" if summary.skipped else ""
+    echo(
+        f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
+        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
+        f"computed by {info.backend}{skipped}"
+    )
+    echo(f"view it with: rerun {folder / 'rollout-0.rrd'}")
     _raise_failure(summary, folder)
 
 
@@ -133,34 +149,3 @@ def _show(bar: Any, tick: Tick) -> None:
     plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
     bar.set_postfix_str(f"{tick.mode}{plan}", refresh=False)
     bar.update(1)
-
-
-def _report(config: DeployConfig, summary: LiveSummary) -> dict[str, Any]:
-    """Content of ``deploy.json`` besides its `provenance`."""
-    return {
-        "robot": config.robot.type,
-        "ticks": summary.ticks,
-        "ticks_running": summary.running,
-        "ticks_held": summary.held,
-        "plans": summary.planned,
-        "plans_late": summary.late,
-        "skipped_observations": summary.skipped,
-        **percentiles("plan_ms", summary.plan_ms),
-        **percentiles("latency_ms", summary.latency_ms),
-        "iterations_mean": float(np.mean(summary.iterations or [0])),
-        "missing_ticks": summary.missing_ticks,
-        "damped": summary.damped,
-        "failure": "" if summary.failure is None else describe_failure(summary.failure),
-        "events": summary.events,
-    }
-
-
-def _print(summary: LiveSummary, info: RunInfo, folder: Path) -> None:
-    latency = percentiles("ms", summary.latency_ms)
-    echo(
-        f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
-        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
-        f"computed by {info.backend}"
-        + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
-    )
-    echo(f"view it with: rerun {folder / 'rollout-0.rrd'}")

@@ -10,6 +10,8 @@ from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 from egovcp_deploy.robots.realsense_camera import RealSenseConfig, RealSenseDepthCamera
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
 
+type AnyCamera = ZmqDepthCamera | RealSenseDepthCamera
+
 
 @dataclass(frozen=True)
 class CameraOptions:
@@ -41,7 +43,7 @@ class Hardware:
     """What the control loop reads and writes."""
 
     body: BridgeRobot
-    camera: ZmqDepthCamera | RealSenseDepthCamera
+    camera: AnyCamera
 
     def link(self, now_ns: int) -> dict[str, float]:
         """Statistics of the messages of the last second, for the log: `Tick.link`."""
@@ -64,8 +66,7 @@ class Hardware:
 
 def open_hardware(bridge: BridgeConfig, camera: CameraOptions) -> Hardware:
     """Connect to body and camera; raises `EnvironmentFailure` if one does not answer."""
-    body = BridgeRobot(bridge)
-    body.connect()
+    body = BridgeRobot(bridge).connect()
     try:
         return Hardware(body, open_camera(camera))
     except BaseException:
@@ -73,10 +74,8 @@ def open_hardware(bridge: BridgeConfig, camera: CameraOptions) -> Hardware:
         raise
 
 
-def open_camera(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera:
+def open_camera(options: CameraOptions) -> AnyCamera:
     """Connect to the camera; raises `EnvironmentFailure` if it does not answer."""
     if options.type == "realsense":
         return RealSenseDepthCamera.connect(options.realsense)
-    camera = ZmqDepthCamera(options.server)
-    camera.connect()
-    return camera
+    return ZmqDepthCamera(options.server).connect()

@@ -9,14 +9,16 @@ import sys
 import termios
 import tty
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
 
 from egovcp.errors import UsageError
 from egovcp.rate import NS_PER_S, RateLimiter
 from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
-from egovcp_deploy.robots.remote_control import RemoteControl
+from egovcp_deploy.robots.wire import RemoteControl
 
 if TYPE_CHECKING:
     from egovcp_deploy.config import OperatorOptions
@@ -31,7 +33,6 @@ class Operator(Protocol):
 
     def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
         """New commands; ``mode`` is the robot's `State`, empty: unknown."""
-        ...
 
 
 class AutomaticOperator:
@@ -107,42 +108,22 @@ class Keyboard:
 
     def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
         """One command per key, and the velocity ten times a second."""
-        commands = [_KEYS[key] for key in self._pressed() if key in _KEYS]
-        if self._limiter.ready(now_ns):
-            commands.append(OperatorCommand(velocity=self._velocity))
-        return commands
-
-    def _pressed(self) -> Iterator[str]:
-        """Keys waiting in the terminal; those for the velocity are applied."""
+        commands = []
         while select.select([sys.stdin], [], [], 0.0)[0]:
             key = os.read(sys.stdin.fileno(), 1).decode(errors="replace")
             if not key:
-                return
-            if key == "x":
+                break
+            if key in _KEYS:
+                commands.append(_KEYS[key])
+            elif key == "x":
                 self._velocity = (0.0, 0.0, 0.0)
-            if key in _VELOCITY_STEPS:
-                sums = (
-                    v + step for v, step in zip(self._velocity, _VELOCITY_STEPS[key], strict=True)
-                )
-                vx, vy, yaw_rate = (round(v, 3) for v in sums)
+            elif key in _VELOCITY_STEPS:
+                sums = np.round(np.add(self._velocity, _VELOCITY_STEPS[key]), 3)
+                vx, vy, yaw_rate = sums.tolist()
                 self._velocity = (vx, vy, yaw_rate)
-            yield key
-
-
-@contextmanager
-def _keyboard() -> Iterator[Keyboard]:
-    if not sys.stdin.isatty():
-        raise UsageError(
-            "--operator.type=keyboard needs a terminal, but the input is none; "
-            "run it in one, or choose --operator.type=auto"
-        )
-    before = termios.tcgetattr(sys.stdin)
-    echo(_KEYBOARD_HELP)
-    try:
-        tty.setcbreak(sys.stdin)
-        yield Keyboard()
-    finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        if self._limiter.ready(now_ns):
+            commands.append(OperatorCommand(velocity=self._velocity))
+        return commands
 
 
 # --- the robot's remote control --------------------------------------------------------------
@@ -179,9 +160,22 @@ class RemoteOperator:
         ]
 
 
-def open_operator(options: OperatorOptions) -> AbstractContextManager[Operator]:
+@contextmanager
+def open_operator(options: OperatorOptions) -> Iterator[Operator]:
     """The operator of ``options.type``; raises `UsageError` without a terminal to read keys from.
     The terminal is restored afterwards."""
-    if options.type == "keyboard":
-        return _keyboard()
-    return nullcontext(AutomaticOperator(options.velocity, options.duration))
+    if options.type == "auto":
+        yield AutomaticOperator(options.velocity, options.duration)
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(
+            "--operator.type=keyboard needs a terminal, but the input is none; "
+            "run it in one, or choose --operator.type=auto"
+        )
+    before = termios.tcgetattr(sys.stdin)
+    echo(_KEYBOARD_HELP)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield Keyboard()
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

@@ -30,8 +30,6 @@ from egovcp_deploy.pilot.planner import (
 )
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 
-type OnTick = Callable[[Tick], None]
-
 _WAIT_S: Final = 0.01
 _AFTER_DAMP_S: Final = 1.0  # still recorded once the motors are damped
 _START_S: Final = 60.0  # for the control process to send its first observation
@@ -51,12 +49,10 @@ class LiveSummary:
     held: int = 0  # ticks in HOLD
     damped: str = ""  # why the motors were damped before the run was over; empty: they were not
     plan_ms: list[float] = field(default_factory=list)
-    latency_ms: list[float] = field(default_factory=list)
-    """From each observation until its plan was sent."""
+    latency_ms: list[float] = field(default_factory=list)  # from an observation to its plan
     iterations: list[int] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
-    missing_ticks: dict[str, int] = field(default_factory=dict)
-    """Log -> ticks that it lacks, because its disk was full or too slow."""
+    missing_ticks: dict[str, int] = field(default_factory=dict)  # see `recording.missing_ticks`
     failure: Exception | None = None  # what ended the planning, after which the robot was held
 
 
@@ -101,25 +97,23 @@ class PlannerLoop:
         self._held_ns: int | None = None
         self._damped_ns: int | None = None
 
-    def run(self, on_tick: OnTick = lambda tick: None) -> LiveSummary:
-        """Run until the operator ends it, the motors are damped, or the control process ends.
-
-        An exception ends the planning but not the run, see `LiveSummary.failure`.
-        """
-        started_ns = self._clock.now_ns()
+    def run(self, on_tick: Callable[[Tick], None] = lambda tick: None) -> LiveSummary:
+        """Run until the operator ends it, the motors are damped, or the control process ends. An
+        exception ends the planning but not the run, see `LiveSummary.failure`."""
+        started_ns, self._on_tick = self._clock.now_ns(), on_tick
         with stop_on_signal(signals=(signal.SIGINT,), interrupt=False) as self.interrupts:
             while not self.quitting and self._control_alive():
                 if self._begin_ns is None and self._clock.now_ns() - started_ns > _START_S * _NS:
                     break
                 try:
-                    self._step(on_tick)
+                    self._step()
                 except Exception as error:  # noqa: BLE001 - the robot must not fall, whatever it is
                     self._fail(error)
         with suppress(Exception):  # an error of the log must not hide why the run ended
-            self._log_last_tick(on_tick)
+            self._log_last_tick()
         return self.summary
 
-    def _step(self, on_tick: OnTick) -> None:
+    def _step(self) -> None:
         """Pass on the operator's commands, plan from new observations, and log them."""
         self._handle_commands(self._clock.now_ns())
         observations = self._receive()
@@ -129,7 +123,7 @@ class PlannerLoop:
                 plan = self._plan(observations)
         finally:  # observations are logged even if the planner fails
             for observation in observations:
-                self._log(observation, plan if observation is observations[-1] else None, on_tick)
+                self._log(observation, plan if observation is observations[-1] else None)
 
     def _receive(self) -> list[ObservationMessage]:
         received = (decode_observation(parts) for parts in self._link.receive(_WAIT_S))
@@ -173,36 +167,29 @@ class PlannerLoop:
         summary.plan_ms.append(plan.plan_ms)
         summary.latency_ms.append(latency * 1e3)
         summary.iterations.append(plan.step.iterations)
-        before = self._runner.samples
-        if self._runner.adapt(plan, late):
-            after = self._runner.samples
-            cause = "time to spare" if after > before else "too little time"
-            self._events.append(f"{cause}: {after} candidates from now on")
+        self._events += self._runner.adapt(plan, late)
 
     # --- the log -------------------------------------------------------------------------
-    def _log(
-        self, observation: ObservationMessage, plan: PlanMessage | None, on_tick: OnTick
-    ) -> None:
+    def _log(self, observation: ObservationMessage, plan: PlanMessage | None) -> None:
         """Log the tick before: the next observation holds the action that was sent in it."""
         before, self._pending = self._pending, (observation, plan)
         if before is not None and before[0].tick == observation.tick - 1:
-            self._write(*before, observation, on_tick)
+            self._write(*before, observation)
 
-    def _log_last_tick(self, on_tick: OnTick) -> None:
+    def _log_last_tick(self) -> None:
         """Log the last tick with why the run ended. No observation follows it, so its action is
         unknown; the action before it is logged instead."""
         if self._pending is not None:
             (observation, plan), self._pending = self._pending, None
             reason = self._end_reason or "the control process is gone"
             self._events.append(f"end of the run: {reason}")
-            self._write(observation, plan, observation, on_tick)
+            self._write(observation, plan, observation)
 
     def _write(
         self,
         observation: ObservationMessage,
         plan: PlanMessage | None,
         following: ObservationMessage,
-        on_tick: OnTick,
     ) -> None:
         assert self._begin_ns is not None
         events = (*observation.events, *(plan.events if plan else ()), *self._events)
@@ -222,7 +209,7 @@ class PlannerLoop:
             **planner_fields(plan),
         )
         self._sink.write(tick)
-        on_tick(tick)
+        self._on_tick(tick)
 
     # --- a failure ------------------------------------------------------------------------
     def _fail(self, error: Exception) -> None:

@@ -24,7 +24,6 @@ from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.control_process import control_process, damp_motors
 from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
 from egovcp_deploy.live.link import Link
-from egovcp_deploy.robots.base import LowLevelRobot
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 
@@ -123,7 +122,7 @@ class DampingWatchdog:
     def __init__(
         self,
         process: BaseProcess,
-        body: LowLevelRobot,
+        body: BridgeRobot,
         expected: Callable[[], bool] = lambda: False,
     ) -> None:
         self._process, self._body, self.expected = process, body, expected
@@ -166,9 +165,15 @@ def simulated_robot(
     ours, theirs = multiprocessing.get_context("spawn").Pipe(duplex=False)
     with child_process(_simulate, fake, theirs, os.getpid(), name="egovcp-simulator"):
         theirs.close()
-        command, state, port = _received_ports(ours)
-        camera = ZmqCameraConfig(port=port, vertical_fov=config.env.camera.vertical_fov)
-        bridge = BridgeConfig(state_port=state, command_port=command)
+        ports = None
+        with suppress(EOFError):
+            if ours.poll(_SIMULATOR_START_S):
+                ports = ours.recv()
+        if ports is None:
+            raise EnvironmentFailure("the simulator did not start, see its message above")
+        fov = config.env.camera.vertical_fov
+        camera = ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov)
+        bridge = BridgeConfig(state_port=ports.state_port, command_port=ports.command_port)
         yield bridge, CameraOptions(server=camera)
 
 
@@ -178,12 +183,4 @@ def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:
 
     die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
-    serve(fake, lambda ports: pipe.send((ports.command_port, ports.state_port, ports.camera_port)))
-
-
-def _received_ports(pipe: Connection) -> tuple[int, int, int]:
-    with suppress(EOFError):
-        if pipe.poll(_SIMULATOR_START_S):
-            command, state, camera = pipe.recv()
-            return command, state, camera
-    raise EnvironmentFailure("the simulator did not start, see its message above")
+    serve(fake, pipe.send)

@@ -30,14 +30,11 @@ def run(config: RecoverConfig) -> None:
     if not config.file or not config.output:
         raise UsageError("two files are needed; usage: egovcp-mcap recover TORN OUT")
     ticks, reader = recover(Path(config.file), Path(config.output))
-    echo(f"{config.output}: {ticks} ticks; {config.file} {_state(reader)}")
-
-
-def _state(reader: RecordingReader) -> str:
+    state = "is torn: its end is missing" if reader.torn else "was already complete"
     if reader.damaged:
         torn = ", and its end is missing" if reader.torn else ""
-        return f"is damaged: {reader.loss_text()}{torn}"
-    return "is torn: its end is missing" if reader.torn else "was already complete"
+        state = f"is damaged: {reader.loss_text()}{torn}"
+    echo(f"{config.output}: {ticks} ticks; {config.file} {state}")
 
 
 def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:

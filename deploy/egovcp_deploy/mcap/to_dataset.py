@@ -9,7 +9,7 @@ import shlex
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -166,7 +166,10 @@ def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
     may end earlier: a torn recording that was recovered begins with the same rows."""
     seen: list[tuple[Path, list[bytes]]] = []
     for path in paths:
-        rows = _row_digests(read_episode(path, gaps)[0])
+        episode, _ = read_episode(path, gaps)
+        columns = (episode.depth, episode.state, episode.action, episode.reward)
+        content = (b"".join(c[t].tobytes() for c in columns) for t in range(len(episode)))
+        rows = [hashlib.blake2b(row, digest_size=16).digest() for row in content]
         for other, other_rows in seen:
             shared = min(len(rows), len(other_rows))
             if rows[:shared] == other_rows[:shared]:
@@ -177,13 +180,6 @@ def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
         seen.append((path, rows))
 
 
-def _row_digests(episode: Episode) -> list[bytes]:
-    """A digest of each row: observation, action and reward."""
-    columns = (episode.depth, episode.state, episode.action, episode.reward)
-    rows = (b"".join(column[t].tobytes() for column in columns) for t in range(len(episode)))
-    return [hashlib.blake2b(row, digest_size=16).digest() for row in rows]
-
-
 def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     """Convert a recording to an episode; the text says what was left out. Raises `DataError` if it
     is not ours, damaged, or has missing ticks or invalid values."""
@@ -192,7 +188,7 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     reader = RecordingReader(path)
     try:
         raw_ticks = reader.raw_ticks()
-        ticks = _until_end(_planned(raw.tick(ROW_TOPICS) for raw in raw_ticks))
+        ticks = list(_episode_ticks(raw.tick(ROW_TOPICS) for raw in raw_ticks))
         deque(raw_ticks, maxlen=0)  # read on to the end: damage may follow the episode
         reader.require_undamaged()
         kept, gap = _before_gap(ticks, reader.info.fps)
@@ -210,9 +206,10 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     return episode, cut if reader.complete else f"{cut}; the file is torn there"
 
 
-def _planned(ticks: Iterator[Tick]) -> Iterator[Tick]:
+def _episode_ticks(ticks: Iterator[Tick]) -> Iterator[Tick]:
     """The ticks from the first to the last in RUN, without those in which a robot on the wall clock
-    stands up or is damped; all ticks of a recording without states."""
+    stands up or is damped; all ticks of a recording without states. None follows the one that ends
+    the episode."""
     begun = False
     for tick in ticks:
         if tick.mode in ("", State.RUN):
@@ -221,16 +218,8 @@ def _planned(ticks: Iterator[Tick]) -> Iterator[Tick]:
             return
         if begun:
             yield tick
-
-
-def _until_end(ticks: Iterator[Tick]) -> list[Tick]:
-    """The ticks up to the one that ends the episode; a recording may continue after it."""
-    kept = []
-    for tick in ticks:
-        kept.append(tick)
-        if tick.terminated or tick.truncated:
-            break
-    return kept
+            if tick.terminated or tick.truncated:
+                return
 
 
 def _before_gap(ticks: Sequence[Tick], fps: int) -> tuple[list[Tick], str]:
@@ -242,8 +231,7 @@ def _before_gap(ticks: Sequence[Tick], fps: int) -> tuple[list[Tick], str]:
         entered_run = any(f"-> {State.RUN}" in event for event in first.events)
         if first.index > 0 and not entered_run:
             return [], "its first ticks are missing"
-    for i in range(1, len(ticks)):
-        before, tick = ticks[i - 1], ticks[i]
+    for i, (before, tick) in enumerate(pairwise(ticks), start=1):
         if not follows(before, tick, fps):
             count = tick.index - before.index - 1
             what = f"{count} ticks are missing" if count else "the robot paused"

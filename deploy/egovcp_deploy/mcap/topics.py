@@ -90,7 +90,7 @@ class TopicRecording:
         """Read the times of all messages; raises `DataError` if the file is damaged, or lacks a
         topic, or one is too slow."""
         require_mcap(path)
-        self.path, self._fps = path, mapping.fps
+        self.path, self._fps, self._decoders = path, mapping.fps, DecoderFactory()
         times: dict[str, list[int]] = {}
         for _, channel, message in self._messages(None):
             times.setdefault(channel.topic, []).append(message.log_time)
@@ -135,14 +135,9 @@ class TopicRecording:
         return min(found)
 
     def rows(self, shapes: dict[str, tuple[int, ...]]) -> Iterator[dict[str, Array]]:
-        """The rows, feature -> image (H, W, C) or values (n,).
-
-        Args:
-            shapes: those of earlier rows, which must be the same; completed by the first row.
-
-        Raises:
-            DataError: a message cannot be decoded, lacks a field, or has another shape.
-        """
+        """The rows, feature -> image (H, W, C) or values (n,). ``shapes`` are those of earlier
+        rows, which must be the same; the first row completes them. Raises `DataError` if a message
+        cannot be decoded, lacks a field, or has another shape."""
         latest: dict[str, tuple[Schema | None, Channel, Message]] = {}
         messages = self._messages(self._topics)
         following = next(messages, None)
@@ -183,10 +178,6 @@ class TopicRecording:
             return decode(message.data)
         except Exception as error:  # decoders raise many types on damaged messages
             raise DataError(f"{channel.topic} is damaged: {error!r}") from error
-
-    @cached_property
-    def _decoders(self) -> DecoderFactory:
-        return DecoderFactory()
 
     def _messages(
         self, topics: set[str] | None

@@ -42,8 +42,7 @@ class PlanBuffer:
     def __init__(self) -> None:
         self._plan: Array | None = None
         self._tick = -1
-        self.misses = 0
-        """Consecutive ticks without a plan in time."""
+        self.misses = 0  # consecutive ticks without a plan in time
 
     def offer(self, tick: int, plan: NDArray[np.floating]) -> bool:
         """Take the plan (N, 7) made for ``tick``; false if it is not finite or not newer."""
@@ -172,7 +171,7 @@ class Pilot:
         self.tick = 0  # the planner tick of the next observation, or of the pending action
         self.sent: Array = np.zeros(robot.action_dim)  # a_{t-1}, (7,)
         self._safety = SafetyFilter(1, robot.action_dim)
-        self._plans = PlanBuffer()
+        self.plans = PlanBuffer()
         repeats = not robot.is_g1
         self._proprioception, self._image = Freshness(repeats), Freshness(repeats)
         self._tilt, self._height = 0.0, 0.74
@@ -209,7 +208,7 @@ class Pilot:
             state_age_s=self._proprioception.age_s(now_ns),
             image_age_s=self._image.age_s(now_ns),
             planner_silence_s=(now_ns - waiting[0].time_ns) / 1e9 if waiting else 0.0,
-            misses=self._plans.misses,
+            misses=self.plans.misses,
             tilt=self._tilt,
             height=self._height,
             planner_alive=self._planner.alive,
@@ -217,7 +216,7 @@ class Pilot:
         self._events += self.supervisor.update(facts, request)
         if before is State.ARMED and self.supervisor.state is State.RUN:
             self._first = True
-            self._plans = PlanBuffer()
+            self.plans = PlanBuffer()
         return self.supervisor.state
 
     def add_events(self, events: Iterable[str]) -> None:
@@ -270,25 +269,15 @@ class Pilot:
             self._events += plan.events
             if self._first or plan.tick < self._restart_tick:
                 continue
-            if not self._plans.offer(plan.tick, plan.actions):
+            if not self.plans.offer(plan.tick, plan.actions):
                 self._events.append(REJECTED)
             if plan.tick == self.tick:
                 current = plan
         return current
 
-    @property
-    def misses(self) -> int:
-        """Consecutive ticks without a plan in time."""
-        return self._plans.misses
-
-    @property
-    def has_plan(self) -> bool:
-        """Whether a usable plan for this tick has arrived."""
-        return self._plans.has(self.tick)
-
     def next_action(self) -> Array:
         """a_t (7,); call it once per tick. The next tick begins."""
-        wanted = self._plans.action(self.tick)
+        wanted = self.plans.action(self.tick)
         if self.supervisor.state is not State.RUN or self._first:
             self.sent = self._safety.ease()[0]
         elif wanted is None:

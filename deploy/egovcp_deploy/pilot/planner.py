@@ -40,8 +40,6 @@ GOOD_TO_DOUBLE: Final = 50  # consecutive good plans, 2 s
 _COMPENSATION: Final = 0.5
 _MIN_SAMPLES: Final = 64
 _MIN_ELITES: Final = 4  # the mean of two follows Q's errors too closely (docs/planner.md)
-
-
 _HANDS: Final[tuple[Hand, ...]] = ("left", "right")
 _BACKENDS: Final = {
     "ReferenceEvaluator": "eager",
@@ -55,7 +53,6 @@ class RolloutPolicy(Protocol):
 
     def reset(self) -> None:
         """Every robot has just begun an episode."""
-        ...
 
     def act(
         self,
@@ -65,15 +62,12 @@ class RolloutPolicy(Protocol):
     ) -> PolicyStep:
         """Depth (E, 48, 64) mm and state (E, 74) -> plans, within ``remaining()`` s. Arrays that
         the policy does not compute are empty."""
-        ...
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         """Filter depth (E, 48, 64) mm and state (E, 74) without planning."""
-        ...
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Advance by a tick with the actions (E, 7) that were sent."""
-        ...
 
 
 def backend_of(policy: RolloutPolicy) -> str:
@@ -126,8 +120,7 @@ class PlanMessage:
     step: PolicyStep  # for one robot
     plan_ms: float  # time to filter and plan
     events: tuple[str, ...] = ()  # log lines of the planner
-    reconstructed: NDArray[np.float32] | None = None
-    """(48, 64) m: o_t decoded by the world model, for the log."""
+    reconstructed: NDArray[np.float32] | None = None  # (48, 64) m: o_t decoded, for the log
     imagined: NDArray[np.float32] | None = None  # (K, 48, 64) m: predictions 1..K ticks ahead
     value_maps: tuple[ValueMap, ...] = ()
 
@@ -142,16 +135,13 @@ class PlannerClient(Protocol):
 
     def submit(self, observation: ObservationMessage) -> None:
         """Send o_t to the planner."""
-        ...
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         """Plans that have arrived by ``now_ns``, oldest first."""
-        ...
 
     @property
     def alive(self) -> bool:
         """False once the planner is known to have ended."""
-        ...
 
 
 class AdaptiveBudget:
@@ -220,18 +210,16 @@ class PlannerRunner:
         plan_ms = (time.perf_counter() - begin) * 1e3
         return PlanMessage(last.tick, step, plan_ms, events=tuple(events))
 
-    def adapt(self, plan: PlanMessage, late: bool) -> bool:
-        """Adapt the number of samples to whether ``plan`` was late; true if it has changed."""
+    def adapt(self, plan: PlanMessage, late: bool) -> tuple[str, ...]:
+        """Adapt the number of samples to whether ``plan`` was late; a log line if it has
+        changed."""
         if self._budget is None or not self._budget.record(late, plan.step.iterations):
-            return False
+            return ()
         assert isinstance(self._policy, Policy)
-        self._policy.config = self._budget.config
-        return True
-
-    @property
-    def samples(self) -> int:
-        """Present number of candidates per iteration; 0 of a policy that does not plan."""
-        return 0 if self._budget is None else self._budget.config.samples
+        before, self._policy.config = self._policy.config, self._budget.config
+        after = self._policy.config.samples
+        cause = "time to spare" if after > before.samples else "too little time"
+        return (f"{cause}: {after} candidates from now on",)
 
     def warm_up(self) -> None:
         """Plan and decode on a blank observation: the first calls compile and allocate."""
@@ -296,23 +284,20 @@ class InlinePlanner:
 
 def planner_fields(plan: PlanMessage | None, robot: RobotSpec = G1) -> dict[str, Any]:
     """The fields of `Tick` that come from the planner; unknown ones are left out. Candidates are
-    the paths of the hands of a G1."""
+    the best ones as paths of the hands of a G1, m, heading frame."""
     if plan is None:
         return {}
-    step = plan.step
+    step, candidates = plan.step, None
+    if step.candidates.size and robot.is_g1:
+        actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, N, 7)
+        hands = ACTION_BOX.to_metric(actions)[..., ACTION_HANDS].reshape(*actions.shape[:2], 2, 3)
+        candidates = Candidates(hands, step.candidate_values[0, :LOGGED_CANDIDATES])
     return {
         "depth_reconstructed": plan.reconstructed,
         "depth_imagined": plan.imagined,
         "value_maps": plan.value_maps,
         "plan": step.plan[0] if step.plan.size else None,
-        "candidates": _candidates(step) if step.candidates.size and robot.is_g1 else None,
+        "candidates": candidates,
         "value": float(step.value[0]) if step.value.size else None,
         "termination": float(step.termination[0]) if step.termination.size else None,
     }
-
-
-def _candidates(step: PolicyStep) -> Candidates:
-    """The best candidates as hand paths, m, heading frame."""
-    actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, N, 7)
-    hands = ACTION_BOX.to_metric(actions)[..., ACTION_HANDS].reshape(*actions.shape[:2], 2, 3)
-    return Candidates(hands, step.candidate_values[0, :LOGGED_CANDIDATES])

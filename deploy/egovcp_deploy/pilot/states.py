@@ -42,8 +42,7 @@ class OperatorCommand(NamedTuple):
     """One input of the operator."""
 
     request: OperatorRequest | None = None
-    velocity: tuple[float, float, float] | None = None
-    """vx, vy (m/s), yaw rate (rad/s); None: unchanged."""
+    velocity: tuple[float, float, float] | None = None  # m/s, m/s, rad/s; None: unchanged
     quit: bool = False  # end the control process; it damps the motors first
 
 
@@ -87,8 +86,7 @@ class Facts:
     refusal: str = ""  # why the robot must not be armed; empty: no reason
     hold: str = ""  # why another check requires HOLD; empty: no reason
     damp: str = ""  # why another check requires DAMP; empty: no reason
-    skipped: str = ""
-    """Fault of the readings rejected since the last valid one; empty: none was rejected."""
+    skipped: str = ""  # fault of the readings rejected since the last valid one; empty: none
 
 
 _TRANSITIONS: Final = {

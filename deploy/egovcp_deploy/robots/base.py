@@ -1,6 +1,6 @@
 """Interfaces of robots.
 
-`SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `LowLevelRobot` and
+`SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `BridgeRobot` and
 `DepthCamera` are the motors, IMU and camera of a robot on the wall clock, whose low-level
 controller runs in our process.
 """
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import EFFORT_LIMIT
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES, Solid
 
 Array = NDArray[np.float64]
@@ -41,9 +42,7 @@ class ActionResult:
     terminated: bool = False
     truncated: bool = False
     success: bool = False
-    parts: Mapping[str, bool] = field(
-        default_factory=dict
-    )  # ``success`` of each part of a sequence
+    parts: Mapping[str, bool] = field(default_factory=dict)  # success of each part of a sequence
     events: tuple[str, ...] = ()
 
 
@@ -57,10 +56,8 @@ class LowState:
     quaternion_w: Array  # (4,) orientation of the pelvis, (w, x, y, z)
     angular_velocity: Array  # (3,) rad/s, pelvis frame
     mode: int = 0  # ``mode_machine``; every command must repeat it
-    remote: bytes = b""
-    """Message of the operator's remote control (`remote_control`); empty if there is none."""
-    motors: MotorReadings | None = None
-    """Torque, temperature and status of the motors; None if the robot does not report them."""
+    remote: bytes = b""  # message of the operator's remote control; empty if there is none
+    motors: MotorReadings | None = None  # None if the robot does not report them
 
 
 @dataclass(frozen=True)
@@ -90,32 +87,11 @@ class DepthImage:
     None if unknown."""
 
 
-class LowLevelRobot(Protocol):
-    """Motors and IMU. No call blocks."""
-
-    def read(self) -> LowState | None:
-        """Return the newest reading; None before the first."""
-        ...
-
-    def write(self, command: MotorCommand) -> None:
-        """Send joint targets; they hold until the next command."""
-        ...
-
-    def close(self) -> None:
-        """Release the connection; may be called more than once."""
-        ...
-
-
 class DepthCamera(Protocol):
     """A depth camera. No call blocks."""
 
     def read(self) -> DepthImage | None:
         """Return the newest image; None before the first."""
-        ...
-
-    def close(self) -> None:
-        """Release the camera; may be called more than once."""
-        ...
 
 
 def proprioception(state: LowState, command: NDArray[np.floating]) -> Array:
@@ -123,14 +99,8 @@ def proprioception(state: LowState, command: NDArray[np.floating]) -> Array:
     ``command`` sent (10,): velocity 3, hands 6 (m), height (m)."""
     out = np.empty(STATE_DIM)
     out[STATE_SLICES["angular_velocity"]] = state.angular_velocity
-    out[STATE_SLICES["projected_gravity"]] = projected_gravity(state.quaternion_w)
+    out[STATE_SLICES["projected_gravity"]] = -rotation_matrix(state.quaternion_w)[2]
     out[COMMAND_SLICE] = command
     out[STATE_SLICES["joint_position"]] = state.joint_position
     out[STATE_SLICES["joint_velocity"]] = state.joint_velocity
     return out
-
-
-def projected_gravity(quaternion_w: NDArray[np.floating]) -> Array:
-    """Rotate the world's down (0, 0, -1) into the frame of a unit quaternion wxyz (4,)."""
-    w, x, y, z = (float(part) for part in quaternion_w)
-    return np.array([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import zmq
@@ -18,6 +18,7 @@ from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
+from egovcp_deploy.robots import wire
 from egovcp_deploy.robots.base import Array, LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
 from egovcp_deploy.robots.subscriber import (
@@ -25,14 +26,6 @@ from egovcp_deploy.robots.subscriber import (
     Subscriber,
     connect_socket,
     connection_error,
-)
-from egovcp_deploy.robots.wire import (
-    COMMAND_PORT,
-    MAX_BYTES,
-    STATE_PORT,
-    MalformedMessage,
-    decode_state,
-    encode_command,
 )
 
 LISTEN_S: Final = 0.5  # readings that are needed for a result
@@ -90,9 +83,9 @@ class BridgeConfig:
 
     host: str = "127.0.0.1"
     """Host of LeRobot's bridge: usually 192.168.123.164 for a G1, 127.0.0.1 for egovcp-fake-g1."""
-    state_port: int = bounded(STATE_PORT, least=1, most=65535)
+    state_port: int = bounded(wire.STATE_PORT, least=1, most=65535)
     """Port for states."""
-    command_port: int = bounded(COMMAND_PORT, least=1, most=65535)
+    command_port: int = bounded(wire.COMMAND_PORT, least=1, most=65535)
     """Port for commands."""
     mode: int | None = None
     """Required mode machine, which identifies the robot's variant; null: any with 29 joints and a
@@ -158,7 +151,7 @@ class CommandConflictDetector:
 
 
 class BridgeRobot:
-    """`LowLevelRobot` over LeRobot's bridge. Call `connect` first."""
+    """Motors and IMU of a G1 over LeRobot's bridge. Call `connect` first; no other call blocks."""
 
     def __init__(self, config: BridgeConfig | None = None) -> None:
         self.config = config or BridgeConfig()
@@ -176,9 +169,9 @@ class BridgeRobot:
         self._rejection = ""
         self._subscriber: Subscriber | None = None
 
-    def connect(self, timeout: float = 5.0) -> None:
-        """Wait up to ``timeout`` s for the first reading; raises `EnvironmentFailure` if none
-        arrived, or one of an unexpected robot."""
+    def connect(self, timeout: float = 5.0) -> Self:
+        """Wait up to ``timeout`` s for the first reading; returns itself. Raises
+        `EnvironmentFailure` if none arrived, or one of an unexpected robot."""
         self._open()
         deadline = time.monotonic() + timeout
         while self._newest is None and time.monotonic() < deadline:
@@ -191,6 +184,7 @@ class BridgeRobot:
         if problem:
             self.close()
             raise EnvironmentFailure(problem)
+        return self
 
     def _open(self) -> None:
         config = self.config
@@ -200,7 +194,9 @@ class BridgeRobot:
         self._commands.setsockopt(zmq.IMMEDIATE, 1)  # nothing is queued without a connection
         try:
             connect_socket(self._commands, config.host, config.command_port)
-            self._subscriber = Subscriber(config.host, config.state_port, MAX_BYTES, self._handle)
+            self._subscriber = Subscriber(
+                config.host, config.state_port, wire.MAX_BYTES, self._handle
+            )
         except EnvironmentFailure:
             self._context.destroy(linger=0)
             raise
@@ -216,8 +212,8 @@ class BridgeRobot:
             return False
         self._payload = payload
         try:
-            state = decode_state(payload, time_ns)
-        except MalformedMessage as error:
+            state = wire.decode_state(payload, time_ns)
+        except wire.MalformedMessage as error:
             self._malformed += 1
             self._reject(str(error), time_ns)
             return False
@@ -227,7 +223,12 @@ class BridgeRobot:
             return False
         self.arrivals.record_arrival(time_ns)
         self._conflicts.update(state)
-        self._track_mode(state)
+        if self._mode is None:
+            self._mode = state.mode
+        if state.mode == self._mode:
+            self._mode_changed_ns = None
+        elif self._mode_changed_ns is None:
+            self._mode_changed_ns = time_ns
         self._newest = state
         self._rejected = 0
         return True
@@ -237,24 +238,16 @@ class BridgeRobot:
         self._rejected += 1
         self._rejection = problem
 
-    def _track_mode(self, state: LowState) -> None:
-        if self._mode is None:
-            self._mode = state.mode
-        if state.mode == self._mode:
-            self._mode_changed_ns = None
-        elif self._mode_changed_ns is None:
-            self._mode_changed_ns = state.time_ns
-
     def read(self) -> LowState | None:
-        """Return the newest reading; its time is its time of arrival."""
+        """Return the newest reading, None before the first; its time is its time of arrival."""
         return self._newest
 
     def write(self, command: MotorCommand) -> None:
-        """Send joint targets; drops a command that no motor could follow, and every command while
-        no bridge is connected."""
+        """Send joint targets, which hold until the next command; drops a command that no motor
+        could follow, and every command while no bridge is connected."""
         try:
-            self._commands.send(encode_command(command), zmq.NOBLOCK)
-        except (MalformedMessage, zmq.Again):
+            self._commands.send(wire.encode_command(command), zmq.NOBLOCK)
+        except (wire.MalformedMessage, zmq.Again):
             return
         self._conflicts.record_command(command)
 
@@ -266,11 +259,9 @@ class BridgeRobot:
 
     @property
     def fault(self) -> str:
-        """Why the motors must be damped; empty: no reason.
-
-        The mode machine has differed from the first one for `MODE_CHANGE_S`: the robot does not
-        match the controller's assumptions any more, or has left low-level control.
-        """
+        """Why the motors must be damped; empty: no reason. The mode machine has differed from the
+        first one for `MODE_CHANGE_S`: the robot does not match the controller's assumptions any
+        more, or has left low-level control."""
         newest, since = self._newest, self._mode_changed_ns
         if newest is None or since is None or newest.time_ns - since < MODE_CHANGE_S * 1e9:
             return ""
@@ -318,10 +309,8 @@ class BridgeRobot:
         )
 
     def close(self) -> None:
-        """Stop the thread and close the sockets; may be called more than once.
-
-        Sends nothing: the motors keep their last command.
-        """
+        """Stop the thread and close the sockets; may be called more than once. Sends nothing: the
+        motors keep their last command."""
         if self._subscriber is None or self._commands.closed:
             return
         self._subscriber.close()

@@ -22,14 +22,11 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egovcp.robot.g1 import EFFORT_LIMIT, VELOCITY_LIMIT
 from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
-from egovcp_deploy.robots.base import LowState
-
-Array = NDArray[np.float64]
+from egovcp_deploy.robots.base import Array, LowState
 
 #: rad/s: 2000 deg/s, the full scale of common MEMS gyroscopes; Unitree publishes none for the G1.
 GYROSCOPE_RANGE: Final = 2000.0 * np.pi / 180.0

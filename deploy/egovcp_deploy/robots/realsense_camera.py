@@ -122,8 +122,6 @@ class RealSenseDepthCamera:
             )
         self._raw: NDArray[np.uint16] | None = None
         self._newest: DepthImage | None = None
-        self.problem = ""
-        """Why the last `read` found no new image, in the driver's words."""
         self.arrivals = ArrivalMonitor(numbered=True)  # images between two reads are not lost
         """Arrivals of the images that were read."""
 
@@ -131,9 +129,36 @@ class RealSenseDepthCamera:
     def connect(cls, config: RealSenseConfig) -> Self:
         """Start the camera; raises `EnvironmentFailure` if its driver is not installed, or there is
         no such camera."""
-        driver = _start(config)
+        if not config.serial:
+            raise EnvironmentFailure(
+                "no camera was named; give its serial number, which lerobot-find-cameras realsense "
+                "prints"
+            )
+        require_realsense()
+        import pyrealsense2 as rs
+        from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
+
+        lerobot_config = RealSenseCameraConfig(
+            serial_number_or_name=config.serial,
+            fps=config.fps,
+            width=config.width,
+            height=config.height,
+            use_rgb=False,
+            use_depth=True,
+        )
         try:
-            return cls(driver, _intrinsics(driver), config.vertical_fov)
+            driver = RealSenseCamera(lerobot_config)
+            driver.connect()
+        except (ConnectionError, RuntimeError, TimeoutError, ValueError) as error:
+            raise EnvironmentFailure(
+                f"the camera {config.serial} cannot be used: {error}; see lerobot-find-cameras "
+                "realsense, and its USB 3 cable"
+            ) from error
+        try:
+            stream = driver.rs_profile.get_stream(rs.stream.depth).as_video_stream_profile()
+            i = stream.get_intrinsics()
+            intrinsics = Intrinsics(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
+            return cls(driver, intrinsics, config.vertical_fov)
         except BaseException:
             driver.disconnect()
             raise
@@ -143,11 +168,15 @@ class RealSenseDepthCamera:
         if self._driver is None:
             return self._newest
         now_ns = time.monotonic_ns()
-        captured_ns = self._captured_ns(now_ns)  # before the image: too old rather than too new
+        # When the driver received its newest image; it gives no time of exposure. It is read before
+        # the image: too old rather than too new.
+        stamp: float | None = getattr(self._driver, "latest_timestamp", None)  # perf_counter, s
+        captured_ns = None
+        if stamp is not None:
+            captured_ns = now_ns - max(0, time.perf_counter_ns() - round(stamp * 1e9))
         try:
             raw = self._driver.read_latest_depth(max_age_ms=_MAX_AGE_MS)
-        except (RuntimeError, TimeoutError, ConnectionError) as error:
-            self.problem = str(error)
+        except (RuntimeError, TimeoutError, ConnectionError):
             return self._newest
         if raw is not self._raw:
             self._raw = raw
@@ -155,14 +184,6 @@ class RealSenseDepthCamera:
             self._newest = DepthImage(time_ns, self._resample(raw), captured_ns)
             self.arrivals.record_arrival(time_ns)
         return self._newest
-
-    def _captured_ns(self, now_ns: int) -> int | None:
-        """When the driver received its newest image, at most ``now_ns``; None if unknown. LeRobot's
-        driver gives no time of exposure."""
-        stamp: float | None = getattr(self._driver, "latest_timestamp", None)  # perf_counter, s
-        if stamp is None:
-            return None
-        return now_ns - max(0, time.perf_counter_ns() - round(stamp * 1e9))
 
     def close(self) -> None:
         """Stop the camera; may be called more than once."""
@@ -174,41 +195,3 @@ class RealSenseDepthCamera:
 def require_realsense() -> None:
     """Raise `MissingPackage` if LeRobot's RealSense camera is not installed."""
     require_packages("egovcp-deploy", "the camera", "lerobot", "pyrealsense2")
-
-
-def _start(config: RealSenseConfig) -> Any:
-    """Connect LeRobot's camera."""
-    if not config.serial:
-        raise EnvironmentFailure(
-            "no camera was named; give its serial number, which lerobot-find-cameras realsense "
-            "prints"
-        )
-    require_realsense()
-    from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
-
-    lerobot_config = RealSenseCameraConfig(
-        serial_number_or_name=config.serial,
-        fps=config.fps,
-        width=config.width,
-        height=config.height,
-        use_rgb=False,
-        use_depth=True,
-    )
-    try:
-        driver = RealSenseCamera(lerobot_config)
-        driver.connect()
-    except (ConnectionError, RuntimeError, TimeoutError, ValueError) as error:
-        raise EnvironmentFailure(
-            f"the camera {config.serial} cannot be used: {error}; see lerobot-find-cameras "
-            "realsense, and its USB 3 cable"
-        ) from error
-    return driver
-
-
-def _intrinsics(driver: Any) -> Intrinsics:
-    """Intrinsics of the camera's depth stream."""
-    import pyrealsense2 as rs
-
-    stream = driver.rs_profile.get_stream(rs.stream.depth).as_video_stream_profile()
-    found = stream.get_intrinsics()
-    return Intrinsics(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError, UsageError
-from egovcp.log.mcap_reader import Recording, read_recording
+from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import CameraView
 from egovcp.robot_spec import RobotSpec
 from egovcp_deploy.pilot.states import State
@@ -28,13 +28,9 @@ RECORDING_ENDS: Final = "recording ends"
 class ReplayRobot:
     """Robot in lock-step whose rollout i is the i-th of ``files``, MCAP files that may be torn. A
     run on the wall clock begins at its first tick in RUN, where the policy's recurrence started.
-
-    Raises `UsageError` without files, `DataError` if the first is damaged or has no ticks.
-    """
+    Raises `DataError` if the first file is damaged or has no ticks."""
 
     def __init__(self, files: Sequence[Path]) -> None:
-        if not files:
-            raise UsageError("no recordings to play back")
         self._files = files
         self._number = -1
         self.start(0)
@@ -65,7 +61,13 @@ class ReplayRobot:
         if not 0 <= episode < self.count:
             raise UsageError(f"no recording {episode}; there are {self.count} recordings")
         if episode != self._number:
-            self._recording, self._number = _read(self._files[episode]), episode
+            path = self._files[episode]
+            recording = read_recording(path, damaged_ok=False)
+            if not recording.ticks:
+                raise DataError(f"{path} has no ticks; there is nothing to play back")
+            first = next((i for i, t in enumerate(recording.ticks) if t.mode == State.RUN), 0)
+            self._recording = replace(recording, ticks=recording.ticks[first:])
+            self._number = episode
         self._tick = 0
 
     def observe(self) -> RobotObservation:
@@ -96,9 +98,6 @@ class ReplayRobot:
     def damp(self) -> None:
         """Do nothing."""
 
-    def close(self) -> None:
-        """Do nothing."""
-
 
 def open_recordings(path: Path) -> ReplayRobot:
     """Open a recording, or a folder of them as egovcp-deploy writes it. Raises `UsageError` if the
@@ -120,11 +119,3 @@ def _number(path: Path) -> tuple[int, str]:
     """Sort key that puts rollout-10 after rollout-9."""
     digits = "".join(c for c in path.stem if c.isdigit())
     return int(digits or 0), path.name
-
-
-def _read(path: Path) -> Recording:
-    recording = read_recording(path, damaged_ok=False)
-    first = next((i for i, tick in enumerate(recording.ticks) if tick.mode == State.RUN), 0)
-    if not recording.ticks:
-        raise DataError(f"{path} has no ticks; there is nothing to play back")
-    return replace(recording, ticks=recording.ticks[first:])

@@ -29,20 +29,15 @@ class SimRobot:
     """Robot in lock-step whose rollout i is held-out scenario i of ``task`` and ``seed``."""
 
     def __init__(self, config: EnvConfig, task: str, seed: int) -> None:
-        self._env = make_env(config, 1, [task])
-        self.spec = self._env.robot
+        self.env = make_env(config, 1, [task])
+        """The simulator, for scripted policies that use its privileged state."""
+        self.controller_id = self.env.controller_id
+        """Identity of the simulated robot's low-level controller."""
+        self.spec = self.env.robot
         """The kind of robot."""
-        self._fov = config.camera.vertical_fov
-        self._mount = config.camera.position
-        self._task = task
-        self._seed = seed
+        self._camera, self._task, self._seed = config.camera, task, seed
         self._observation: Observation | None = None
         self._logged: set[str] = set()
-
-    @property
-    def controller_id(self) -> str:
-        """Identity of the simulated robot's low-level controller."""
-        return self._env.controller_id
 
     @property
     def camera(self) -> CameraView:
@@ -50,29 +45,24 @@ class SimRobot:
         which is not used."""
         if not self.spec.is_g1:
             return CameraView()
-        pitch = self._env.instances[0].camera_pitch if self._env.instances else 0.0
-        return CameraView("torso_link", self._mount, pitch, self._fov)
-
-    @property
-    def env(self) -> BaseVectorEnv:
-        """The simulator, for scripted policies that use its privileged state."""
-        return self._env
+        pitch = self.env.instances[0].camera_pitch if self.env.instances else 0.0
+        return CameraView("torso_link", self._camera.position, pitch, self._camera.vertical_fov)
 
     def start(self, episode: int) -> None:
         """Reset to scenario ``episode``."""
         self.scenario = held_out(self._task, self._seed, episode)
-        self._observation = self._env.reset([self.scenario])
+        self._observation = self.env.reset([self.scenario])
         self._logged = set()
 
     def observe(self) -> RobotObservation:
         """Return the observation, with the simulator's poses of pelvis and scene."""
         assert self._observation is not None, "start an episode first"
-        poses = true_poses(self._env, 0)
+        poses = true_poses(self.env, 0)
         return RobotObservation(self._observation.depth[0], self._observation.state[0], *poses)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
         """Apply ``action`` for 40 ms of simulated time."""
-        result = self._env.step(action[None])
+        result = self.env.step(action[None])
         self._observation = result.observation
         terms = {name: float(values[0]) for name, values in result.reward_terms.items()}
         return ActionResult(
@@ -88,7 +78,7 @@ class SimRobot:
 
     def _events(self, terms: dict[str, float]) -> list[str]:
         """Events that happened for the first time in this episode."""
-        task = self._env.instances[0].task
+        task = self.env.instances[0].task
         events = [find_task(task.current_name).event] if task.since_event > 0.0 else []
         counted = [n for n, value in terms.items() if value != 0.0 and n not in ACTION_TERMS]
         events += [_TERM_EVENTS.get(name, name) for name in counted]
@@ -98,11 +88,11 @@ class SimRobot:
 
     def damp(self) -> None:
         """Damp the simulated motors until the next `start`."""
-        self._env.damp(0)
+        self.env.damp(0)
 
     def close(self) -> None:
         """Stop the simulator's threads."""
-        self._env.close()
+        self.env.close()
 
 
 def true_poses(env: BaseVectorEnv, row: int) -> tuple[NDArray[np.float64], tuple[Solid, ...]]:

@@ -46,10 +46,8 @@ class ArrivalStats:
 
     rate_hz: float = 0.0  # usable messages per second
     jitter_ms: float = 0.0  # 99th percentile of |interval - median interval|
-    gap_ms: float = 0.0
-    """Longest time without a usable message, including the time since the last one."""
-    lost: float = 0.0
-    """Share of the sent messages that did not arrive or were not usable, in [0, 1]."""
+    gap_ms: float = 0.0  # longest time without a usable message, also since the last one
+    lost: float = 0.0  # share of the sent messages that did not arrive or were not usable
 
 
 class ArrivalMonitor:

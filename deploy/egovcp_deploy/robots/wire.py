@@ -13,6 +13,13 @@ the rest of the state is used.
 The first 29 of the 35 motors are ``spec.JOINT_NAMES`` in order; the others are not fitted. Received
 messages may be damaged or hostile: every required value is checked, and an invalid message raises
 `MalformedMessage`.
+
+``wireless_remote`` holds, in base64, the 40 bytes of the operator's remote control:
+
+    0-1 header   2-3 buttons, a bit each   4 lx   8 rx   12 ry   16 L2   20 ly   24-39 unused
+
+Its numbers are little-endian float32 in [-1, 1]. The order of the buttons is that of
+``lerobot.teleoperators.unitree_g1``; the offsets are those of Unitree's SDK. Untested on hardware.
 """
 
 from __future__ import annotations
@@ -20,6 +27,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Never
@@ -28,11 +36,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
-from egovcp_deploy.robots.base import LowState, MotorCommand
-
-Array = NDArray[np.float64]
+from egovcp_deploy.robots.base import Array, LowState, MotorCommand
 
 COMMAND_PORT: Final = 6000
 STATE_PORT: Final = 6001
@@ -81,6 +88,19 @@ MOTOR_STATUS_BITS: Final = {
     0x80000000: "the robot's computer lost the connection to the motor",
 }
 DISCONNECTED: Final = 0x80000000
+
+_REMOTE_BYTES: Final = 40
+#: Bit 0 first. R1 and L1 are LeRobot's RB and LB, R2 and L2 its RT and LT.
+BUTTONS: Final = (
+    *("R1", "L1", "start", "select", "R2", "L2", "F1", "F2"),
+    *("A", "B", "X", "Y", "up", "right", "down", "left"),
+)
+#: vx, vy (m/s) and yaw rate (rad/s) at full deflection of the sticks.
+FULL_STICK: Final = (0.6, 0.2, 0.5)
+
+_REMOTE_LAYOUT: Final = struct.Struct("<2sHfffff16x")
+_REMOTE_HEADER: Final = b"\x55\x51"
+_MAX_AXIS: Final = 1.05  # a worn stick may exceed 1
 
 
 class MalformedMessage(Exception):
@@ -162,23 +182,33 @@ def decode_command(payload: bytes) -> LowCommand:
 def encode_state(state: LowState, acceleration: Array) -> bytes:
     """Encode a ``rt/lowstate`` as LeRobot's bridge sends it; ``state`` has `LowState.motors`, and
     ``acceleration`` (3,) is the specific force in the IMU frame, m/s^2."""
-    assert state.motors is not None, "every rt/lowstate has torques"
+    motors = state.motors
+    assert motors is not None, "every rt/lowstate has torques"
     columns = {
         "q": state.joint_position.tolist(),
         "dq": state.joint_velocity.tolist(),
-        "tau_est": state.motors.torque.tolist(),
-        **_encode_optional_fields(state.motors),
+        "tau_est": motors.torque.tolist(),
     }
+    if motors.temperature is not None:
+        readings = motors.temperature.tolist()
+        columns["temperature"] = [each[0] if len(each) == 1 else each for each in readings]
+    if motors.faults is not None:
+        columns["motorstate"] = motors.faults.tolist()
+    if motors.enabled is not None:
+        columns["mode"] = motors.enabled.astype(int).tolist()
     rows = zip(*columns.values(), strict=True)
-    motors = [dict(zip(columns, row, strict=True)) for row in rows]
+    fitted = [dict(zip(columns, row, strict=True)) for row in rows]
+    r = rotation_matrix(state.quaternion_w)
+    roll, yaw = math.atan2(r[2, 1], r[2, 2]), math.atan2(r[1, 0], r[0, 0])
+    pitch = math.asin(min(max(-r[2, 0], -1.0), 1.0))
     empty = {"q": 0.0, "dq": 0.0, "tau_est": 0.0, "temperature": 0.0}
     data = {
-        "motor_state": motors + [empty] * (MOTOR_SLOTS - NUM_JOINTS),
+        "motor_state": fitted + [empty] * (MOTOR_SLOTS - NUM_JOINTS),
         "imu_state": {
             "quaternion": state.quaternion_w.tolist(),
             "gyroscope": state.angular_velocity.tolist(),
             "accelerometer": acceleration.tolist(),
-            "rpy": _roll_pitch_yaw(state.quaternion_w),
+            "rpy": [roll, pitch, yaw],
             "temperature": 35.0,
         },
         "wireless_remote": base64.b64encode(state.remote).decode("ascii"),
@@ -195,6 +225,7 @@ def decode_state(payload: bytes, time_ns: int) -> LowState:
     imu = data.get("imu_state")
     if not isinstance(imu, dict):
         raise MalformedMessage("imu_state is missing")
+    modes = _integers([motor.get("mode") for motor in motors])
     quaternion = _numbers(imu.get("quaternion"), 1.0 + _QUATERNION_TOLERANCE, "quaternion", 4)
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
@@ -207,7 +238,12 @@ def decode_state(payload: bytes, time_ns: int) -> LowState:
         angular_velocity=_numbers(imu.get("gyroscope"), _MAX_SPEED, "gyroscope", 3),
         mode=_mode(data, "mode_machine"),
         remote=_remote(data.get("wireless_remote", "")),
-        motors=_motor_readings(motors),
+        motors=MotorReadings(
+            torque=_numbers([m.get("tau_est") for m in motors], _MAX_TORQUE, "tau_est"),
+            temperature=_temperatures([motor.get("temperature") for motor in motors]),
+            faults=_integers([motor.get("motorstate") for motor in motors]),
+            enabled=None if modes is None else modes == _ENABLED,
+        ),
     )
 
 
@@ -272,39 +308,6 @@ def _remote(text: object) -> bytes:
         raise MalformedMessage("wireless_remote is not base64") from error
 
 
-def _roll_pitch_yaw(quaternion: Array) -> list[float]:
-    """(3,) rad of a unit quaternion wxyz."""
-    w, x, y, z = quaternion.tolist()
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return [float(roll), float(pitch), float(yaw)]
-
-
-def _motor_readings(motors: Sequence[dict[str, Any]]) -> MotorReadings:
-    """Torques, and the optional fields that are valid."""
-    modes = _integers([motor.get("mode") for motor in motors])
-    return MotorReadings(
-        torque=_numbers([m.get("tau_est") for m in motors], _MAX_TORQUE, "tau_est"),
-        temperature=_temperatures([motor.get("temperature") for motor in motors]),
-        faults=_integers([motor.get("motorstate") for motor in motors]),
-        enabled=None if modes is None else modes == _ENABLED,
-    )
-
-
-def _encode_optional_fields(motors: MotorReadings) -> dict[str, list[Any]]:
-    """Field name -> one value per motor, of the fields that are not None."""
-    fields: dict[str, list[Any]] = {}
-    if motors.temperature is not None:
-        rows = motors.temperature.tolist()
-        fields["temperature"] = [row[0] if len(row) == 1 else row for row in rows]
-    if motors.faults is not None:
-        fields["motorstate"] = motors.faults.tolist()
-    if motors.enabled is not None:
-        fields["mode"] = motors.enabled.astype(int).tolist()
-    return fields
-
-
 def _temperatures(values: Sequence[object]) -> Array | None:
     """(29, 1) or (29, 2) deg C, NaN for invalid values; None if no motor reports any: bridges
     without temperatures omit the field or fill it with zeros."""
@@ -327,3 +330,44 @@ def _integers(values: Sequence[object]) -> NDArray[np.int64] | None:
     if all(type(value) is int and 0 <= value < 2**32 for value in values):
         return np.array(values, np.int64)
     return None
+
+
+# --- the remote control ----------------------------------------------------------------------
+@dataclass(frozen=True)
+class RemoteControl:
+    """Sticks and buttons of the operator's remote control; its message is ``wireless_remote``."""
+
+    lx: float = 0.0  # left stick, 1 is right
+    ly: float = 0.0  # left stick, 1 is forward
+    rx: float = 0.0  # right stick, 1 is right
+    ry: float = 0.0  # right stick, 1 is forward
+    pressed: frozenset[str] = frozenset()  # pressed buttons, of `BUTTONS`
+
+    @classmethod
+    def parse(cls, raw: bytes) -> RemoteControl | None:
+        """Decode the message; None if there is no remote control or the bytes are invalid."""
+        if len(raw) != _REMOTE_BYTES:
+            return None
+        _, bits, lx, rx, ry, _, ly = _REMOTE_LAYOUT.unpack(raw)
+        if not all(abs(axis) <= _MAX_AXIS for axis in (lx, ly, rx, ry)):  # also rejects NaN
+            return None
+        pressed = frozenset(name for i, name in enumerate(BUTTONS) if bits >> i & 1)
+        return cls(lx, ly, rx, ry, pressed)
+
+    def to_bytes(self) -> bytes:
+        """Encode the message, in single precision."""
+        bits = sum(1 << i for i, name in enumerate(BUTTONS) if name in self.pressed)
+        return _REMOTE_LAYOUT.pack(_REMOTE_HEADER, bits, self.lx, self.rx, self.ry, 0.0, self.ly)
+
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """(3,) requested vx, vy (m/s, left positive) and yaw rate (rad/s, left positive)."""
+        return np.array([self.ly, -self.lx, -self.rx]) * FULL_STICK
+
+    @classmethod
+    def from_velocity(
+        cls, velocity: NDArray[np.floating], pressed: frozenset[str] = frozenset()
+    ) -> RemoteControl:
+        """Sticks that request ``velocity`` (3,), limited to full deflection."""
+        forward, left, turn = np.clip(np.asarray(velocity) / FULL_STICK, -1.0, 1.0).tolist()
+        return cls(lx=-left, ly=forward, rx=-turn, pressed=pressed)

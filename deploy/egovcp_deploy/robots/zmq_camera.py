@@ -17,7 +17,7 @@ import struct
 import time
 import zlib
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,9 +111,9 @@ class ZmqDepthCamera:
         self._sequence: int | None = None
         self._subscriber: Subscriber | None = None
 
-    def connect(self, timeout: float = 5.0) -> None:
-        """Wait up to ``timeout`` s for the first image; raises `EnvironmentFailure` if none
-        arrived, or one of another field of view."""
+    def connect(self, timeout: float = 5.0) -> Self:
+        """Wait up to ``timeout`` s for the first image; returns itself. Raises `EnvironmentFailure`
+        if none arrived, or one of another field of view."""
         config = self.config
         self._subscriber = Subscriber(config.host, config.port, FRAME_BYTES, self._handle)
         deadline = time.monotonic() + timeout
@@ -123,6 +123,7 @@ class ZmqDepthCamera:
             reason = self._timeout_reason(timeout)
             self.close()
             raise EnvironmentFailure(reason)
+        return self
 
     def _handle(self, message: bytes, time_ns: int) -> bool:
         """Process a message that arrived at ``time_ns``; whether it is a new image."""

@@ -17,7 +17,6 @@ from egovcp_deploy.live.control import (
     VELOCITY_RAMP,
     VelocityCommand,
     damping_command,
-    position_command,
     ramp_command,
 )
 from egovcp_deploy.pilot.states import OperatorRequest, State
@@ -115,7 +114,7 @@ def test_a_plan_that_is_ready_within_its_tick_is_never_missed(
     rig = make_rig(lambda tick: delay_ms)
     rig.go()
     rig.run(2.0)
-    assert rig.loop.pilot.misses == 0
+    assert rig.loop.pilot.plans.misses == 0
     assert set(rig.states[-100:]) == {State.RUN}
 
 
@@ -371,7 +370,7 @@ def test_targets_exceed_joint_ranges_by_0_1_to_0_6_rad() -> None:
 def test_motor_commands_are_finite_and_bounded_for_any_input(make: str) -> None:
     rng = np.random.default_rng(0)
     build: dict[str, Callable[[], MotorCommand]] = {
-        "position": lambda: position_command(wild(rng), GAIN, GAIN, 5),
+        "position": lambda: ramp_command(wild(rng), wild(rng), GAIN, GAIN, 1.0, 5),
         "ramp": lambda: ramp_command(wild(rng), wild(rng), GAIN, GAIN, float(rng.normal(0, 3)), 5),
         "damping": lambda: damping_command(wild(rng), 5),
     }

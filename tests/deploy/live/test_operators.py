@@ -7,7 +7,7 @@ import pytest
 
 from egovcp_deploy.live.operators import RemoteOperator
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest
-from egovcp_deploy.robots.remote_control import FULL_STICK, RemoteControl
+from egovcp_deploy.robots.wire import FULL_STICK, RemoteControl
 
 
 def pressed(*buttons: str) -> bytes:

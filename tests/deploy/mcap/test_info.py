@@ -11,7 +11,7 @@ import pytest
 
 from egovcp.log.tick import MotorReadings, Tick
 from egovcp_deploy.mcap.cli import main
-from egovcp_deploy.mcap.info import RecordingSummary
+from egovcp_deploy.mcap.info import summarise
 
 from .conftest import Record
 
@@ -35,13 +35,13 @@ def live(tick: Tick) -> Tick:
 
 
 def test_state_changes_have_time_and_reason(record: Record) -> None:
-    changes = RecordingSummary(record(keep=live)).changes
-    assert [(c.before, c.after, c.reason) for c in changes] == [
+    changes = summarise(record(keep=live))[0]["states"]
+    assert [(c["before"], c["after"], c["reason"]) for c in changes] == [
         ("armed", "run", "the operator asked for it"),
         ("run", "hold", "no new picture for 210 ms"),
         ("hold", "damp", "the pelvis is tilted by 1.10 rad"),
     ]
-    assert [c.time_s for c in changes] == pytest.approx([0.04, 0.12, 0.24])
+    assert [c["time_s"] for c in changes] == pytest.approx([0.04, 0.12, 0.24])
 
 
 def test_info_as_text(record: Record, capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,4 +69,4 @@ def test_a_recording_without_motors_has_no_table(
     file = record()
     assert main(["info", str(file)]) == 0
     assert "max torque" not in capsys.readouterr().out
-    assert RecordingSummary(file).torque is None
+    assert summarise(file)[0]["joint_maxima"] is None

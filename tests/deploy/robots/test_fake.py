@@ -80,7 +80,7 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
     episodes = EpisodeSequencer(
         driver.fake,
         FakeG1Config(gantry=0.5, settle=0.5, pause=0.1),
-        lambda n: scenarios[n] if n < 2 else None,
+        iter(scenarios),
         log.append,
     )
     heights = []
@@ -102,7 +102,7 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
 
 
 def test_the_gantry_waits_for_commands_with_stiffness(fake: FakeBridge) -> None:
-    episodes = EpisodeSequencer(fake, FakeG1Config(gantry=0.0), lambda n: Scenario("ball", 0, 0))
+    episodes = EpisodeSequencer(fake, FakeG1Config(gantry=0.0), iter([Scenario("ball", 0, 0)]))
     for _ in range(100):
         episodes.step()
     assert fake.robot.phase is Phase.HELD
@@ -116,7 +116,7 @@ def test_the_gantry_waits_for_commands_with_stiffness(fake: FakeBridge) -> None:
 
 
 def test_the_gantry_waits_for_release_without_a_schedule(fake: FakeBridge) -> None:
-    episodes = EpisodeSequencer(fake, FakeG1Config(gantry=None), lambda n: Scenario("ball", 0, 0))
+    episodes = EpisodeSequencer(fake, FakeG1Config(gantry=None), iter([Scenario("ball", 0, 0)]))
     send(fake, MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
     for _ in range(20):
         episodes.step()
@@ -179,7 +179,7 @@ def test_commands_can_be_ignored_as_a_fault(robot: BridgeRobot, running: FakeG1T
 
 def test_a_push_makes_the_robot_fall(driver: LockstepDriver) -> None:
     config = FakeG1Config(gantry=0.2, settle=100.0)
-    episodes = EpisodeSequencer(driver.fake, config, lambda n: Scenario("ball", 2, n))
+    episodes = EpisodeSequencer(driver.fake, config, iter([Scenario("ball", 2, 0)]))
     while driver.fake.robot.phase is Phase.HELD:
         driver.tick(episodes)
     driver.fake.faults.apply("push")

@@ -21,7 +21,7 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings
 from egovcp_deploy.robots.sim import SimRobot
-from egovcp_deploy.rollouts import LockstepRunner
+from egovcp_deploy.rollouts import run_rollout
 from tests.support.sinks import MemorySink
 
 TICKS = 12
@@ -62,7 +62,7 @@ def watched(artifact_dir: Path, askew: float = 0.0) -> Watched:
 
 
 def run(policy: Watched, robot: SimRobot | ReplayRobot, sink: Sink) -> None:
-    LockstepRunner(InlinePlanner(PlannerRunner(policy)), robot).run(sink)
+    run_rollout(InlinePlanner(PlannerRunner(policy)), robot, sink)
 
 
 def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:

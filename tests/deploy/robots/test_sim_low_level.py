@@ -23,7 +23,7 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     episodes = EpisodeSequencer(
         robot,
         FakeG1Config(gantry=0.3, settle=0.3, pause=0.0),
-        lambda n: Scenario("ball", 4, 0) if n == 0 else None,
+        iter([Scenario("ball", 4, 0)]),
     )
     clock = SimClock(episodes.step)
     rate = FixedRate(50, clock)

@@ -19,11 +19,11 @@ from egovcp.log.tick import MotorReadings
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES
 from egovcp_deploy.robots.base import LowState, MotorCommand
-from egovcp_deploy.robots.remote_control import RemoteControl
 from egovcp_deploy.robots.wire import (
     COMMAND_TOPIC,
     MOTOR_SLOTS,
     MalformedMessage,
+    RemoteControl,
     decode_command,
     decode_state,
     encode_command,

@@ -21,21 +21,10 @@ from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import DAMPED, LiveRobot, ServoCommand
 from egovcp.spec import NUM_JOINTS, PHYSICS_DT
+from egovcp_deploy.robots import wire
 from egovcp_deploy.robots.base import LowState
 from egovcp_deploy.robots.fake.faults import InjectedFaults
-from egovcp_deploy.robots.remote_control import RemoteControl
 from egovcp_deploy.robots.subscriber import bind_socket
-from egovcp_deploy.robots.wire import (
-    CAMERA_PORT,
-    COMMAND_PORT,
-    DISCONNECTED,
-    MAX_BYTES,
-    STATE_PORT,
-    LowCommand,
-    MalformedMessage,
-    decode_command,
-    encode_state,
-)
 from egovcp_deploy.robots.zmq_camera import DepthFrame, encode_frame
 
 WATCHDOG_S: Final = 0.2
@@ -50,11 +39,11 @@ class Ports:
 
     host: str = "127.0.0.1"
     """Interface to listen on; the default is reachable from this machine only."""
-    command_port: int = bounded(COMMAND_PORT, least=0, most=65535)
+    command_port: int = bounded(wire.COMMAND_PORT, least=0, most=65535)
     """Port for commands."""
-    state_port: int = bounded(STATE_PORT, least=0, most=65535)
+    state_port: int = bounded(wire.STATE_PORT, least=0, most=65535)
     """Port for states."""
-    camera_port: int = bounded(CAMERA_PORT, least=0, most=65535)
+    camera_port: int = bounded(wire.CAMERA_PORT, least=0, most=65535)
     """Port for depth images, in the format of egovcp-depth-server."""
 
 
@@ -73,15 +62,13 @@ class FakeBridge:
         detailed: bool = False,
     ) -> None:
         self.robot = robot
-        self.faults = InjectedFaults()
-        """May be changed at any time."""
+        self.faults = InjectedFaults()  # may be changed at any time
         self.pressed: frozenset[str] = frozenset()
+        # State and depth message -> the messages that are sent instead.
         self.alter_state: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
-        """State message -> the messages that are sent instead."""
         self.alter_image: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
-        """Depth message -> the messages that are sent instead."""
+        # Called with every message on the command port.
         self.on_command: Callable[[bytes], None] = lambda message: None
-        """Called with every message on the command port."""
         self._detailed = detailed
         self._rng = np.random.default_rng(0)
         self._time = 0.0  # s of simulated time since the start
@@ -100,23 +87,28 @@ class FakeBridge:
             self.close()
             raise
         self.ports = Ports(ports.host, command_port, state_port, camera_port)
-        """Where it listens."""
 
     def _bind(self, kind: int, host: str, port: int) -> tuple[zmq.Socket[bytes], int]:
         end = self._context.socket(kind)
         end.setsockopt(zmq.SNDHWM, 20)
-        end.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+        end.setsockopt(zmq.MAXMSGSIZE, wire.MAX_BYTES)
         return end, bind_socket(end, host, port)
 
     @property
     def commanded(self) -> bool:
         """Whether the last command has stiffness, so that the motors hold a pose."""
-        return self._servos is not DAMPED and bool(self._servos.stiffness.any())
+        return bool(self._servos.stiffness.any())
 
     def step(self) -> None:
         """Advance by 5 ms."""
         self._receive()
-        self._apply_single_faults()
+        faults = self.faults
+        if faults.push is not None:
+            self.robot.push(np.array([*faults.push, 0.0]))
+            faults.push = None
+        if faults.release:
+            self.robot.release()
+            faults.release = False
         self.robot.drive(self._applied())
         self.robot.advance()
         self._time += PHYSICS_DT
@@ -133,35 +125,28 @@ class FakeBridge:
                 break
             self.on_command(waiting[-1])
         while waiting and not self.faults.ignore_commands:
-            if self._accept(waiting.pop()):
-                break
+            try:
+                command = wire.decode_command(waiting.pop())
+            except wire.MalformedMessage:
+                continue
+            motors, on = command.motors, command.enabled.astype(np.float64)
+            if motors.mode != self._mode or not command.series:
+                continue  # a G1 ignores them too; not series: ankles and waist motor by motor
+            self._last_command = self._time
+            self._servos = ServoCommand(
+                motors.position,
+                on * motors.stiffness,
+                on * motors.damping,
+                command.velocity,
+                on * command.torque,
+            )
+            break
         if self._time - self._last_command > WATCHDOG_S:
             self._servos = DAMPED
-
-    def _accept(self, payload: bytes) -> bool:
-        """Whether the command is applied."""
-        try:
-            command = decode_command(payload)
-        except MalformedMessage:
-            return False
-        if command.motors.mode != self._mode or not command.series:
-            return False  # a G1 ignores them too; not series: ankles and waist motor by motor
-        self._last_command = self._time
-        self._servos = _servos(command)
-        return True
 
     @property
     def _mode(self) -> int:
         return MODE if self.faults.mode is None else self.faults.mode
-
-    def _apply_single_faults(self) -> None:
-        faults = self.faults
-        if faults.push is not None:
-            self.robot.push(np.array([*faults.push, 0.0]))
-            faults.push = None
-        if faults.release:
-            self.robot.release()
-            faults.release = False
 
     def _applied(self) -> ServoCommand:
         """The command that the motors follow, including faults."""
@@ -193,7 +178,7 @@ class FakeBridge:
             return readings
         status = np.zeros(NUM_JOINTS, np.int64)
         if faults.dropped_motor is not None:
-            status[faults.dropped_motor] = DISCONNECTED
+            status[faults.dropped_motor] = wire.DISCONNECTED
         return replace(readings, faults=status, enabled=status == 0)
 
     def _publish_state(self) -> None:
@@ -214,7 +199,7 @@ class FakeBridge:
 
     def _encode_state(self) -> bytes:
         measured = self.robot.measure()
-        remote = RemoteControl.from_velocity(self.robot.operator_velocity, self.pressed)
+        remote = wire.RemoteControl.from_velocity(self.robot.operator_velocity, self.pressed)
         state = LowState(
             time_ns=0,
             joint_position=measured.joint_position,
@@ -225,7 +210,7 @@ class FakeBridge:
             remote=remote.to_bytes(),
             motors=self._motors(measured.torque),
         )
-        return encode_state(state, measured.acceleration)
+        return wire.encode_state(state, measured.acceleration)
 
     def _publish_image(self) -> None:
         step, depth = self.robot.depth_image
@@ -244,16 +229,3 @@ class FakeBridge:
     def close(self) -> None:
         """Stop listening."""
         self._context.destroy(linger=0)
-
-
-def _servos(command: LowCommand) -> ServoCommand:
-    """The command for the simulation; a motor that is not enabled gives no torque."""
-    on = command.enabled.astype(np.float64)
-    motors = command.motors
-    return ServoCommand(
-        motors.position,
-        on * motors.stiffness,
-        on * motors.damping,
-        command.velocity,
-        on * command.torque,
-    )

@@ -7,8 +7,10 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, Final
 
 from egovcp.bounds import bounded
@@ -25,7 +27,7 @@ from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_deploy.options import SEEDS, held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
+from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
@@ -95,69 +97,56 @@ def serve(
     opened: Callable[[Ports], None] = lambda ports: None,
     interrupts: Sequence[int] = (),
 ) -> None:
-    """Serve until the episodes are over or there is an interrupt.
-
-    Args:
-        config: the options.
-        opened: called with the ports once the robot listens.
-        interrupts: a list that a signal handler extends.
-
-    Raises:
-        EnvironmentFailure: a port is in use.
+    """Serve until the episodes are over or a signal handler extends ``interrupts``. ``opened`` is
+    called with the ports once the robot listens. Raises `EnvironmentFailure` if a port is in use.
     """
-    first = held_out(config.task, config.seed, config.episode)
-    robot = LiveRobot(config.env)
-    robot.start(first)
+    numbers = range(config.episodes) if config.episodes else count()
+    scenarios = (held_out(config.task, config.seed, config.episode + i) for i in numbers)
+    lines = queue.SimpleQueue[str]()
+    with closing(FakeBridge(LiveRobot(config.env), config.ports, config.detailed)) as bridge:
+        episodes, ports = EpisodeSequencer(bridge, config, scenarios, _print), bridge.ports
+        opened(ports)
+        _print(
+            f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
+            f"depth {ports.camera_port}; Ctrl-C ends it"
+        )
+        threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
+        pacer, written = StepPacer(MonotonicClock()), 0
+        try:
+            while not (episodes.finished or interrupts):
+                for _ in range(pacer.wait_for_steps()):
+                    episodes.step()
+                while not lines.empty():
+                    line = lines.get()
+                    if line == "quit":
+                        return
+                    try:
+                        _print(bridge.faults.apply(line))
+                    except UsageError as error:
+                        _print(str(error))
+                if bridge.faults.crash:
+                    os._exit(1)
+                if config.json and len(episodes.outcomes) > written:
+                    written = len(episodes.outcomes)
+                    report = [outcome_json(outcome) for outcome in episodes.outcomes]
+                    write_report(config.json, report, durable=False)  # fsync delays the robot
+        finally:
+            if outcomes := episodes.outcomes:
+                successes = sum(outcome.success for outcome in outcomes)
+                _print(f"{len(outcomes)} episodes, {successes} successes")
 
-    def scenario(number: int) -> Scenario | None:
-        if config.episodes and number >= config.episodes:
-            return None
-        return held_out(config.task, config.seed, config.episode + number)
 
-    bridge = FakeBridge(robot, config.ports, detailed=config.detailed)
-    episodes = EpisodeSequencer(bridge, config, scenario, _print)
-    try:
-        opened(bridge.ports)
-        _step_in_real_time(config, bridge, episodes, interrupts)
-    finally:
-        bridge.close()
-        if outcomes := episodes.outcomes:
-            successes = sum(outcome.success for outcome in outcomes)
-            _print(f"{len(outcomes)} episodes, {successes} successes")
-
-
-def _step_in_real_time(
-    config: FakeG1Config,
-    bridge: FakeBridge,
-    episodes: EpisodeSequencer,
-    interrupts: Sequence[int],
-) -> None:
-    ports = bridge.ports
-    _print(
-        f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
-        f"depth {ports.camera_port}; Ctrl-C ends it"
-    )
-    console, pacer, written = Console(), StepPacer(MonotonicClock()), 0
-    while not (episodes.finished or interrupts):
-        for _ in range(pacer.wait_for_steps()):
-            episodes.step()
-        if not console.process(bridge.faults):
-            return
-        if bridge.faults.crash:
-            os._exit(1)
-        if config.json and len(episodes.outcomes) > written:
-            written = len(episodes.outcomes)
-            report = [outcome_json(outcome) for outcome in episodes.outcomes]
-            write_report(config.json, report, durable=False)  # an fsync would delay the robot
+def _read_lines(lines: queue.SimpleQueue[str]) -> None:
+    """Commands from the terminal; runs in a thread."""
+    for line in sys.stdin:
+        lines.put(line.strip())
 
 
 #: Buttons that are pressed in each phase after the first episode.
-_HOLD: Final = frozenset({"B"})
-_RUN: Final = frozenset({"start"})
 _BUTTONS: Final = {
-    Phase.OVER: _HOLD,
-    Phase.HELD: _HOLD,
-    Phase.FREE: _RUN,
+    Phase.OVER: frozenset({"B"}),
+    Phase.HELD: frozenset({"B"}),
+    Phase.FREE: frozenset({"start"}),
     Phase.EPISODE: frozenset[str](),
 }
 
@@ -172,7 +161,7 @@ class EpisodeSequencer:
     Args:
         robot: advanced by `step`.
         config: ``gantry``, ``settle`` and ``pause``, in simulated time.
-        scenarios: number of an episode -> its scenario; None: there are no more.
+        scenarios: those of the episodes, in order.
         log: called with a line for every change of phase.
     """
 
@@ -180,7 +169,7 @@ class EpisodeSequencer:
         self,
         robot: FakeBridge,
         config: FakeG1Config,
-        scenarios: Callable[[int], Scenario | None],
+        scenarios: Iterator[Scenario],
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
         self._robot = robot
@@ -188,24 +177,22 @@ class EpisodeSequencer:
         self._scenarios = scenarios
         self._log = log
         self.outcomes: list[EpisodeOutcome] = []
-        """Outcomes of the finished episodes."""
-        self.finished = False
-        """Whether there are no more episodes."""
+        self.finished = False  # whether there are no more episodes
         self._start()
 
     def _start(self) -> None:
-        scenario = self._scenarios(len(self.outcomes))
+        scenario = next(self._scenarios, None)
         if scenario is None:
             self.finished = True
             return
         self._robot.robot.start(scenario)
-        self._enter(Phase.HELD)
-        self._log(f"episode {scenario.episode} ({scenario.task}): on the gantry")
+        self._enter(Phase.HELD, f"episode {scenario.episode} ({scenario.task}): on the gantry")
 
-    def _enter(self, phase: Phase) -> None:
+    def _enter(self, phase: Phase, line: str) -> None:
         self._phase, self._since = phase, 0.0
-        if self.outcomes or phase is Phase.OVER:
+        if self.outcomes:
             self._robot.pressed = _BUTTONS[phase]
+        self._log(line)
 
     def step(self) -> None:
         """Advance by 5 ms."""
@@ -214,8 +201,14 @@ class EpisodeSequencer:
         self._robot.step()
         robot = self._robot.robot
         if robot.phase is not self._phase:
-            self._enter(robot.phase)
-            self._report()
+            if robot.phase is Phase.OVER:
+                self.outcomes.append(robot.outcome)
+                line = outcome_text(robot.outcome)
+            elif robot.phase is Phase.FREE:
+                line = "the gantry releases the robot"
+            else:
+                line = "the task begins"
+            self._enter(robot.phase, line)
         self._since += PHYSICS_DT
         if self._phase is Phase.HELD:
             if not self._robot.commanded:
@@ -226,16 +219,6 @@ class EpisodeSequencer:
             robot.begin()
         elif self._phase is Phase.OVER and self._since >= max(MIN_PAUSE, self._config.pause):
             self._start()
-
-    def _report(self) -> None:
-        if self._phase is Phase.FREE:
-            self._log("the gantry releases the robot")
-        elif self._phase is Phase.EPISODE:
-            self._log("the task begins")
-        elif self._phase is Phase.OVER:
-            outcome = self._robot.robot.outcome
-            self.outcomes.append(outcome)
-            self._log(outcome_text(outcome))
 
 
 def outcome_text(outcome: EpisodeOutcome) -> str:
@@ -262,30 +245,6 @@ class StepPacer:
         steps = (self._clock.now_ns() - self._next_ns) // _STEP_NS + 1
         self._next_ns += steps * _STEP_NS
         return min(int(steps), _MAX_STEPS)
-
-
-class Console:
-    """Commands from the terminal, read in a thread."""
-
-    def __init__(self) -> None:
-        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
-        for line in sys.stdin:
-            self._lines.put(line.strip())
-
-    def process(self, faults: InjectedFaults) -> bool:
-        """Execute the commands since the last call; returns False on `quit`."""
-        while not self._lines.empty():
-            line = self._lines.get()
-            if line == "quit":
-                return False
-            try:
-                _print(faults.apply(line))
-            except UsageError as error:
-                _print(str(error))
-        return True
 
 
 def outcome_json(outcome: EpisodeOutcome) -> dict[str, Any]:

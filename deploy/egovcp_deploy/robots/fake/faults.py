@@ -28,10 +28,8 @@ class InjectedFaults:
     mode: int | None = None  # report this value of Unitree's `mode_machine` field
     hot_motor: tuple[int, float] | None = None
     """Joint whose motor reports this temperature, deg C (of its winding, if it reports two)."""
-    dropped_motor: int | None = None
-    """Joint whose motor gives no torque. Only detailed states report it."""
-    push: tuple[float, ...] | None = None
-    """Change of the base's velocity, m/s, world x and y; happens once."""
+    dropped_motor: int | None = None  # joint without torque; only detailed states report it
+    push: tuple[float, ...] | None = None  # change of the base's velocity, m/s, world x, y; once
     release: bool = False  # the gantry releases the robot, once
     crash: bool = False  # the process ends at once, without sending anything
 
