@@ -33,7 +33,7 @@ from egovcp.workers import stop_on_signal
 from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_collect.provenance import make_provenance, require_compatible
 from egovcp_collect.worker_pool import WorkerPool
-from egovcp_collect.workers import WorkerGroup
+from egovcp_collect.workers import Worker
 
 PROG: Final = "egovcp-collect"
 _EPILOG: Final = (
@@ -130,8 +130,7 @@ def min_bytes(scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int
     """Lower bound of the bytes that the episodes take, with one shard of them uncompressed."""
     ticks = [env.episode(scenario.task).ticks for scenario in scenarios]
     uncompressed = sum(ticks[:shard_episodes])
-    share = MIN_COMPRESSED_SHARE
-    frame = STAGED_FRAME_BYTES
+    share, frame = MIN_COMPRESSED_SHARE, STAGED_FRAME_BYTES
     if scenarios:
         robot = find_task(scenarios[0].task).robot_spec()
         frame += 2 * (math.prod(robot.depth) - math.prod(G1.depth))
@@ -158,9 +157,9 @@ def _simulate(
     """Planner ticks until every episode is staged, or until a stop signal."""
     if not scenarios:
         return 0
-    group = WorkerGroup(config, committer.staging.folder)
+    start = partial(Worker, config, committer.staging.folder)
     count = config.num_workers or available_cores()
-    pool = WorkerPool(group, count, scenarios, config.num_envs, config.worker_timeout)
+    pool = WorkerPool(start, count, scenarios, config.num_envs, config.worker_timeout)
     steps, began = 0, time.monotonic()
     with stop_on_signal() as stopped, closing(pool):
         while not pool.done and not stopped:

@@ -115,15 +115,13 @@ class CollectConfig:
         return {task: weight for task, weight in weights.items() if weight}
 
 
-def default() -> CollectConfig:
-    """Hands that stay where the random walk puts them, in short episodes."""
-    return CollectConfig()
-
-
 def paper() -> CollectConfig:
     """The paper's random walk (section III-B), in episodes as they are evaluated."""
     return CollectConfig(preset="paper", eta=ACTION_ETA, step_ticks=(1, 1), env=EnvConfig())
 
 
 #: Name -> function that returns the complete configuration.
-PRESETS: Final[Mapping[str, Callable[[], CollectConfig]]] = {"default": default, "paper": paper}
+PRESETS: Final[Mapping[str, Callable[[], CollectConfig]]] = {
+    "default": CollectConfig,
+    "paper": paper,
+}

@@ -18,9 +18,6 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import REWARD_TERMS
 from egovcp_collect.config import CollectConfig
 
-type SimulationResult = tuple[int, list[tuple[int, Episode]]]
-"""Planner ticks, summed over the robots; number and content of each finished episode."""
-
 
 class Simulation:
     """Up to ``config.num_envs`` robots in parallel; a finished one starts the next episode.
@@ -48,8 +45,9 @@ class Simulation:
         """Whether no episode is running or waiting."""
         return not self._waiting and (self._env is None or bool(self._env.done.all()))
 
-    def run(self, seconds: float) -> SimulationResult:
-        """Simulate for about this long, or until idle."""
+    def run(self, seconds: float) -> tuple[int, list[tuple[int, Episode]]]:
+        """Simulate for about this long, or until idle; returns the planner ticks, summed over the
+        robots, and number and content of each finished episode."""
         end = time.monotonic() + seconds
         steps, episodes = 0, list[tuple[int, Episode]]()
         while not self.idle and time.monotonic() < end:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import time
 import traceback
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
@@ -72,6 +74,14 @@ class Worker:
         with inherited_by_workers():
             self.process.start()
         remote.close()
+        self.last_report = time.monotonic()
+        self.unfinished: dict[int, Scenario] = {}
+        """Its episodes by number."""
+
+    @property
+    def waitables(self) -> list[Connection | int]:
+        """What `multiprocessing.connection.wait` returns on a report, or on the worker's death."""
+        return [self.pipe, self.process.sentinel]
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Append episodes to its queue."""
@@ -102,39 +112,21 @@ class Worker:
         self.pipe.close()
 
 
-class WorkerGroup:
-    """Starts workers that stage episodes in the folder ``staging``, and waits for them."""
-
-    def __init__(self, config: CollectConfig, staging: Path) -> None:
-        self._config = config
-        self._staging = staging
-        self._workers: list[Worker] = []
-
-    def start(self) -> Worker:
-        """Start a worker."""
-        worker = Worker(self._config, self._staging)
-        self._workers = [*self._running(), worker]
-        return worker
-
-    def wait(self, seconds: float) -> None:
-        """Block until a worker has reported or died, at most this long."""
-        wait([x for w in self._running() for x in (w.pipe, w.process.sentinel)], timeout=seconds)
-
-    def _running(self) -> list[Worker]:
-        return [worker for worker in self._workers if not worker.pipe.closed]
-
-
 def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: int) -> None:
     """Body of the process; it ends with the pipe or with the parent."""
     try:
-        simulation, stager = Simulation(config), _Stager(StagingDir(staging))
+        simulation, stage = Simulation(config), partial(_stage, StagingDir(staging))
+        disk = ThreadPoolExecutor(1)  # so that the simulation does not wait for the disk
+        pending: deque[Future[int]] = deque()
         while os.getppid() == parent:
             while pipe.poll(None if simulation.idle else 0):  # an idle worker blocks here
                 simulation.add(pipe.recv())
             steps, episodes = simulation.run(_REPORT_S)
-            for number, episode in episodes:
-                stager.submit(number, episode)
-            pipe.send(WorkerReport(steps, stager.finished(wait=simulation.idle)))
+            pending.extend(disk.submit(stage, *episode) for episode in episodes)
+            finished: list[int] = []
+            while pending and (simulation.idle or len(pending) > _MAX_PENDING or pending[0].done()):
+                finished.append(pending.popleft().result())
+            pipe.send(WorkerReport(steps, tuple(finished)))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:  # noqa: BLE001 - every error is reported to the collection
@@ -142,33 +134,7 @@ def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: 
         pipe.send(WorkerReport(0, error=picklable(error)))
 
 
-class _Stager:
-    """Stages episodes on a thread, so that the simulation does not wait for the disk."""
-
-    def __init__(self, staging: StagingDir) -> None:
-        self._staging = staging
-        self._thread = ThreadPoolExecutor(1)
-        self._pending: deque[Future[int]] = deque()
-
-    def submit(self, number: int, episode: Episode) -> None:
-        """Queue an episode."""
-        self._pending.append(self._thread.submit(self._stage, number, episode))
-
-    def _stage(self, number: int, episode: Episode) -> int:
-        self._staging.put(StagedEpisode.of(number, encode_episode(number, episode)))
-        return number
-
-    def finished(self, wait: bool) -> tuple[int, ...]:
-        """Numbers of the episodes staged since the last call.
-
-        Blocks for all queued ones if ``wait``, else until at most `_MAX_PENDING` are queued.
-
-        Raises:
-            DataError: an episode is invalid.
-            OSError: the disk is full.
-        """
-        finished = []
-        pending = self._pending
-        while pending and (wait or len(pending) > _MAX_PENDING or pending[0].done()):
-            finished.append(pending.popleft().result())
-        return tuple(finished)
+def _stage(staging: StagingDir, number: int, episode: Episode) -> int:
+    """Write an episode to the disk; returns its number."""
+    staging.put(StagedEpisode.of(number, encode_episode(number, episode)))
+    return number

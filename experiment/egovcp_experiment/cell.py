@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -70,6 +70,8 @@ class CellCommand:
 
     module: str
     """Module with `main`."""
+    prog: str
+    """The command as typed in a shell, for reports."""
     output: str
     """Flag for the output folder."""
     figures: Callable[[Path], dict[str, Any]]
@@ -78,17 +80,10 @@ class CellCommand:
     """SHA-256 of the outputs that other cells read."""
     resume_flags: Callable[[Path], Flags | None] = lambda folder: None
     """Flags that resume an interrupted run in the folder; None: start again."""
-    prog: str = ""
-    """Name of the command in reports; empty: ``python -m MODULE``."""
     packages: tuple[str, ...] = ()
     """Optional modules that it imports."""
     exclusive: bool = False
     """Whether it measures time, so that no other cell may run at the same time."""
-
-    @property
-    def shell_name(self) -> str:
-        """The command as typed in a shell."""
-        return self.prog or f"python -m {self.module}"
 
 
 @dataclass(frozen=True)
@@ -105,17 +100,9 @@ class Cell:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the cells whose results it reads."""
-        found = (r.cell for r in references(self.flags) if not isinstance(r, ExternalPath))
-        return tuple(dict.fromkeys(found))
-
-
-def references(value: Any) -> Iterator[Reference]:
-    """All references in a value, at any depth."""
-    if isinstance(value, CellOutput | CellFigure | ExternalPath):
-        yield value
-    elif isinstance(value, Mapping | list | tuple):
-        for part in value.values() if isinstance(value, Mapping) else value:
-            yield from references(part)
+        found: list[Reference] = []
+        resolve(self.flags, found.append)
+        return tuple(dict.fromkeys(r.cell for r in found if not isinstance(r, ExternalPath)))
 
 
 def resolve(value: Any, reference_value: Callable[[Reference], Any]) -> Any:
@@ -222,42 +209,44 @@ def _resume_from_checkpoint(folder: Path) -> Flags | None:
 
 COLLECT: Final = CellCommand(
     module="egovcp_collect.collect",
+    prog="egovcp-collect",
     output="dataset.root",
     figures=_collect_figures,
     digest=lambda folder: sha256(folder / HASHES_PATH),
     resume_flags=lambda folder: {"resume": True} if folder.exists() else None,
-    prog="egovcp-collect",
 )
 TRAIN: Final = CellCommand(
     module="egovcp_train.train",
+    prog="egovcp-train",
     output="output_dir",
     figures=_train_figures,
     digest=lambda folder: _artifact_digest(folder / ARTIFACT),
     resume_flags=_resume_from_checkpoint,
-    prog="egovcp-train",
 )
 TRAIN_PPO: Final = CellCommand(
     module="egovcp_train.ppo.train",
+    prog="egovcp-train-ppo",
     output="output_dir",
     figures=_ppo_figures,
     digest=_ppo_digest,
     resume_flags=_resume_from_checkpoint,
-    prog="egovcp-train-ppo",
     packages=("rsl_rl", "tensordict"),
 )
 PLAY: Final = CellCommand(
     module="egovcp_deploy.evaluate",
+    prog="egovcp-eval",
     output="output_dir",
     figures=_eval_figures,
     digest=lambda folder: sha256(folder / "eval_run.json"),
-    prog="egovcp-eval",
 )
 
 
 def study(name: str, exclusive: bool = False) -> CellCommand:
     """The study ``egovcp_experiment.studies.NAME``."""
+    module = f"egovcp_experiment.studies.{name}"
     return CellCommand(
-        module=f"egovcp_experiment.studies.{name}",
+        module=module,
+        prog=f"python -m {module}",
         output="output_dir",
         figures=lambda folder: dict(read_json(folder / RESULT)),
         digest=lambda folder: sha256(folder / RESULT),

@@ -11,6 +11,7 @@ from typing import Any, Final
 import draccus
 
 from egovcp.artifact import load_artifact
+from egovcp.cli import given_options
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError, suggest
 from egovcp.hub import is_local_path
@@ -30,14 +31,13 @@ def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
     Raises:
         UsageError: the scale is unknown, or a config file would override it.
     """
-    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    given = given_options(argv)
     if "config_path" in given:
         raise UsageError("--config_path would hide the scale; give single options as flags")
     name = given.get("scale", ExperimentConfig().scale)
-    known = {str(scale): make for scale, make in SCALES.items()}
-    if name not in known:
-        raise UsageError(f"unknown value --scale={name}{suggest(name, known)}")
-    encoded: dict[str, Any] = draccus.encode(known[name]())
+    if name not in SCALES:
+        raise UsageError(f"unknown value --scale={name}{suggest(name, SCALES)}")
+    encoded: dict[str, Any] = draccus.encode(SCALES[name]())
     return encoded
 
 
@@ -62,7 +62,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
         scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records
         for command in dict.fromkeys(c.command for c in cells if c.name not in records):
-            require_packages("egovcp-experiment", command.shell_name, *command.packages)
+            require_packages("egovcp-experiment", command.prog, *command.packages)
         echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete")
         try:
             scheduler.run()
@@ -112,7 +112,7 @@ COMMANDS: Final = CommandGroup(
     "Run one of the paper's experiments, cell by cell, and write its report.",
     {
         name: Subcommand(
-            f"{__name__}:execute", experiment.SUMMARY, defaults=scale_of, takes_argv=True
+            f"{__name__}:execute", experiment.summary, defaults=scale_of, takes_argv=True
         )
         for name, experiment in EXPERIMENTS.items()
     },

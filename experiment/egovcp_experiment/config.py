@@ -11,7 +11,6 @@ from egovcp.errors import UsageError, suggest
 
 #: The paper's tasks.
 TASKS: Final = ("ball", "wall", "arch")
-Scale = Literal["smoke", "small", "paper"]
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ class ExperimentConfig:
 
     output_dir: str = ""
     """Folder of cells and reports; experiments with the same options can share it."""
-    scale: Scale = "small"
+    scale: Literal["smoke", "small", "paper"] = "small"
     """smoke: minutes, figures without meaning; small: hours on two cores; paper: the paper's."""
     jobs: int = bounded(1, least=1, most=1024)
     """Cells that run at the same time, each on its share of the CPU cores."""
@@ -275,7 +274,7 @@ def paper() -> ExperimentConfig:
     )
 
 
-SCALES: Final[Mapping[Scale, Callable[[], ExperimentConfig]]] = {
+SCALES: Final[Mapping[str, Callable[[], ExperimentConfig]]] = {
     "smoke": smoke,
     "small": small,
     "paper": paper,

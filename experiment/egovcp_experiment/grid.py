@@ -49,16 +49,8 @@ class Model:
     """Changed flags of egovcp-train."""
 
 
-@dataclass(frozen=True)
-class Variant:
-    """A model and how it is played."""
-
-    name: str
-    """Part of the names of cells, unless no flag is changed."""
-    model: Model = field(default_factory=Model)
-    """Its training."""
-    play: Flags = field(default_factory=dict)
-    """Changed flags of egovcp-eval."""
+_UNCHANGED: Final[Flags] = {}
+_DEFAULT_MODEL: Final = Model()
 
 
 class Grid:
@@ -66,6 +58,8 @@ class Grid:
 
     def __init__(self, config: ExperimentConfig) -> None:
         self.config = config
+        self.collected = 1.0
+        """Share of the configured episodes to collect."""
         self._cells: dict[str, Cell] = {}
 
     @property
@@ -78,19 +72,30 @@ class Grid:
         self._cells.setdefault(cell.name, cell)
         return cell
 
+    def episodes(self, task: str, share: float = 1.0) -> int:
+        """Number of episodes in a share of the configured ones."""
+        whole: int = getattr(self.config.data.episodes, task)
+        return max(1, round(share * whole))
+
     def data(self, task: str) -> CellOutput | ExternalPath:
         """Random data of a task."""
         config = self.config.data
         if task in config.roots:
             return ExternalPath(config.roots[task])
-        episodes = getattr(config.episodes, task)
+        episodes = self.episodes(task, self.collected)
         flags = {"task": task, "episodes": episodes, "seed": config.seed}
         extra = (*self.config.scenes, *config.flags)
         return CellOutput(self.add(Cell(f"collect-{task}-{episodes}", COLLECT, flags, extra)).name)
 
-    def model(self, task: str, seed: int, model: Model | None = None) -> CellOutput | ExternalPath:
+    def compared(self, name: str, flags: Flags) -> Model:
+        """A model with equal steps and no time limit, so that slower models do not learn less."""
+        equal = {"steps": self.config.train.compared_steps, "max_minutes": 0}
+        return Model(name, {**equal, **flags})
+
+    def model(
+        self, task: str, seed: int, model: Model = _DEFAULT_MODEL
+    ) -> CellOutput | ExternalPath:
         """Artifact of a model trained on a task, or on `ALL`."""
-        model = model or Model()
         policies = self.config.train.policies
         if task in policies and not model.flags:
             path = policies[task]
@@ -111,19 +116,30 @@ class Grid:
         flags = {**flags, **_parsed(config.flags), **model.flags}
         return self.add(Cell(name or f"train-{task}-{model.name}-s{seed}", TRAIN, flags))
 
-    def play(self, task: str, seed: int, variant: Variant, trained_on: str = "") -> Cell:
-        """The planner in closed loop; ``trained_on``: task of the model, empty: the played one."""
-        trained_on = trained_on or task
-        policy = self.model(trained_on, seed, variant.model)
-        differs = variant.play or variant.model.flags or trained_on != task
-        name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
-        flags = {"controllers": "planner", "policy.path": policy, **variant.play}
-        return self.add(Cell(name, PLAY, {**self.scenarios(task), **flags}))
+    def plays(
+        self,
+        task: str,
+        variant: str = DEFAULT,
+        flags: Flags = _UNCHANGED,
+        model: Model = _DEFAULT_MODEL,
+        trained_on: str = "",
+    ) -> list[str]:
+        """Names of the cells of the planner in closed loop, one per training seed.
 
-    def plays(self, task: str, variant: Variant, trained_on: str = "") -> list[str]:
-        """Names of the `play` cells of all training seeds."""
-        seeds = self.config.train.seeds
-        return [self.play(task, seed, variant, trained_on).name for seed in seeds]
+        Args:
+            variant: part of the names, unless no flag is changed.
+            flags: changed flags of egovcp-eval.
+            trained_on: task of the model; empty: the played one.
+        """
+        trained_on = trained_on or task
+        changed = flags or model.flags or trained_on != task
+        names = []
+        for seed in self.config.train.seeds:
+            policy = {"controllers": "planner", "policy.path": self.model(trained_on, seed, model)}
+            name = f"play-{task}-{variant if changed else DEFAULT}-s{seed}"
+            self.add(Cell(name, PLAY, {**self.scenarios(task), **policy, **flags}))
+            names.append(name)
+        return names
 
     def references(
         self,
@@ -131,14 +147,15 @@ class Grid:
         name: str = "",
         scene: Flags | None = None,
         controllers: Sequence[str] = REFERENCES,
-    ) -> Cell:
-        """Controllers that need no model, on the planner's scenarios in a changed ``scene``."""
+    ) -> str:
+        """Name of the cell of controllers that need no model, on the planner's scenarios in a
+        changed ``scene``."""
         flags = {**self.scenarios(task), "controllers": ",".join(controllers), **(scene or {})}
-        return self.add(Cell(name or f"references-{task}", PLAY, flags))
+        return self.add(Cell(name or f"references-{task}", PLAY, flags)).name
 
     def bounds(self, task: str) -> str:
         """Name of the cell of `BOUNDS`."""
-        return self.references(task, f"bounds-{task}", controllers=BOUNDS).name
+        return self.references(task, f"bounds-{task}", controllers=BOUNDS)
 
     def study(
         self, name: str, task: str, flags: Flags, extra: Sequence[str] = (), exclusive: bool = False

@@ -14,17 +14,18 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
+
+from egovcp.entry_point import INTERRUPTED
 
 if TYPE_CHECKING:  # not imported in the processes of cells
-    from egovcp_experiment.cell import CellCommand
-
-INTERRUPTED: Final = 130  # exit code after Ctrl-C
+    from egovcp_experiment.cell import Cell
 
 
 def versions() -> dict[str, str]:
@@ -40,24 +41,36 @@ def machine() -> dict[str, Any]:
     return {name: value for name, value in hardware().items() if name.startswith("hardware")}
 
 
-class LocalProcess:
-    """A command in a process, which is interrupted when this process ends."""
+class CellProcess:
+    """The command of a cell in a process, which is interrupted when this process ends.
 
-    def __init__(self, module: str, argv: Sequence[str], log: Path) -> None:
+    Args:
+        slot: its number among ``jobs`` processes that share the CPU cores.
+    """
+
+    def __init__(
+        self, cell: Cell, argv: Sequence[str], log: Path, slot: int = 0, jobs: int = 1
+    ) -> None:
+        self.cell, self.argv, self.slot = cell, argv, slot
+        self._start = time.monotonic()
         with log.open("ab") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "egovcp_experiment.local_runner", module, *argv],
+                [sys.executable, "-m", __name__, cell.command.module, *argv],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # the scheduler handles Ctrl-C
                 env=os.environ | {"PYTHONUNBUFFERED": "1"},
             )
+        if jobs > 1 and hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            with suppress(OSError):  # it may have ended already
+                os.sched_setaffinity(self._process.pid, cores[slot::jobs] or cores)
 
     @property
-    def pid(self) -> int:
-        """Process and process group."""
-        return self._process.pid
+    def minutes(self) -> float:
+        """Time since its start."""
+        return (time.monotonic() - self._start) / 60.0
 
     def ended(self) -> int | None:
         """Its exit code, or None."""
@@ -75,26 +88,8 @@ class LocalProcess:
     def kill(self) -> None:
         """Kill it and its children."""
         with suppress(ProcessLookupError):
-            os.killpg(self.pid, signal.SIGKILL)
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
-
-
-class LocalRunner:
-    """Runs at most ``jobs`` commands at a time, each on its share of the CPU cores."""
-
-    def __init__(self, jobs: int = 1) -> None:
-        self._slots: list[LocalProcess | None] = [None] * jobs
-
-    def start(self, command: CellCommand, argv: Sequence[str], log: Path) -> LocalProcess:
-        """Run a command at once."""
-        slot = next(k for k, p in enumerate(self._slots) if p is None or p.ended() is not None)
-        process = self._slots[slot] = LocalProcess(command.module, argv, log)
-        jobs = len(self._slots)
-        if jobs > 1 and hasattr(os, "sched_setaffinity"):
-            cores = sorted(os.sched_getaffinity(0))
-            with suppress(OSError):  # it may have ended already
-                os.sched_setaffinity(process.pid, cores[slot::jobs] or cores)
-        return process
 
 
 def _interrupt_at_end_of_input() -> None:

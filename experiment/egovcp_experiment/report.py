@@ -33,13 +33,8 @@ class Table:
     """Rows of text below a head."""
 
     title: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    def with_columns(self, head: Sequence[str], columns: Sequence[Sequence[str]]) -> Table:
-        """The table with further columns, given row by row."""
-        rows = tuple((*r, *more) for r, more in zip(self.rows, columns, strict=True))
-        return Table(self.title, (*self.head, *head), rows)
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -56,15 +51,15 @@ class Plot:
 type Part = str | Table | Plot
 
 
-@dataclass(frozen=True)
+@dataclass
 class ExperimentReport:
     """Findings of an experiment."""
 
     title: str
     """One line."""
-    shows: tuple[str, ...]
+    shows: list[str] = field(default_factory=list)
     """Conclusions that are derived from the figures."""
-    parts: tuple[Part, ...] = ()
+    parts: list[Part] = field(default_factory=list)
     """Paragraphs, tables and drawings."""
     figures: dict[str, Any] = field(default_factory=dict)
     """The same for programs."""
@@ -96,14 +91,12 @@ def draw(
     ``paint`` gets an empty `matplotlib.figure.Figure` of this width and height, inches.
     """
     import matplotlib  # takes a second
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(
         {"svg.fonttype": "none", "svg.hashsalt": name, "font.size": 9, "axes.grid": False}
     ):
         figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasSVG(figure)
         paint(figure)
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
@@ -131,12 +124,12 @@ def publish(
     if missing:
         total = len(records) + len(missing)
         notes.append(f"**Incomplete**: {len(records)} of {total} cells so far.")
-    report = replace(report, shows=(*notes, *report.shows))
+    report = replace(report, shows=[*notes, *report.shows])
     origin = _origin(records, command)
     content = {
         "experiment": name,
         "title": report.title,
-        "shows": list(report.shows),
+        "shows": report.shows,
         "figures": report.figures,
         "cells": dict(records),
         "missing": list(missing),
@@ -163,7 +156,7 @@ def _origin(records: Mapping[str, Record], command: str) -> list[Part]:
         ", ".join(f"{name} {v}" for name, v in r["settings"]["versions"].items())
         for r in records.values()
     )
-    rows = tuple(
+    rows = [
         (
             name,
             f"{record['minutes']:.1f}",
@@ -173,7 +166,7 @@ def _origin(records: Mapping[str, Record], command: str) -> list[Part]:
             f"`{record['command']}`",
         )
         for name, record in records.items()
-    )
+    ]
     head = ("cell", "minutes", "date", "settings", "result", "command")
     return [
         f"Made by `{command}` on {'; '.join(machines) or 'nothing yet'} ({'; '.join(versions)}).",

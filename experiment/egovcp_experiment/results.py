@@ -10,14 +10,7 @@ import numpy as np
 
 from egovcp.eval_scores import Array, EvalScores, signed_range
 from egovcp_experiment.cell import Record
-from egovcp_experiment.report import (
-    Plot,
-    Table,
-    draw,
-    number,
-    percent,
-    percent_range,
-)
+from egovcp_experiment.report import Plot, Table, draw, number, percent, percent_range
 
 type Records = Mapping[str, Record]
 
@@ -80,8 +73,8 @@ def comparison(title: str, scores: Mapping[str, EvalScores], reference: str) -> 
         ]
         if base is not None:
             row += [""] * 4 if each is base else each.gain(base).columns()
-        rows.append(tuple(row))
-    return Table(title, tuple(head), tuple(rows))
+        rows.append(row)
+    return Table(title, head, rows)
 
 
 def comparison_plot(
@@ -158,23 +151,19 @@ def learning_curves(name: str, caption: str, curves: Sequence[Curve]) -> Plot:
     return draw(name, f"{caption}, 95 % intervals", paint)
 
 
-def _depth_gain(task: Mapping[str, Any], region: str, k: int) -> float | None:
-    return _gain(task["depth"][region][str(k)], "model_mm", "repeat_mm")
-
-
-def _gain(errors: Mapping[str, float | None], model: str, repeat: str) -> float | None:
+def _gain(errors: Mapping[str, float | None], unit: str = "") -> float | None:
     """How many times smaller the model's error is than that of repeating the last row."""
-    ours, theirs = errors[model], errors[repeat]
-    return None if not ours or theirs is None else theirs / ours
+    model, repeat = errors[f"model{unit}"], errors[f"repeat{unit}"]
+    return None if not model or repeat is None else repeat / model
 
 
 #: Column -> its value in egovcp-train's report of one task; None if the episodes do not have it.
 HELDOUT: Final[Mapping[str, Callable[[Mapping[str, Any]], float | None]]] = {
-    "moving, 4 ahead (x)": lambda task: _depth_gain(task, "moving", 4),
-    "moving, 8 (x)": lambda task: _depth_gain(task, "moving", 8),
-    "near, 8 (x)": lambda task: _depth_gain(task, "near", 8),
-    "all pixels, 8 (x)": lambda task: _depth_gain(task, "valid", 8),
-    "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"], "model", "repeat"),
+    "moving, 4 ahead (x)": lambda task: _gain(task["depth"]["moving"]["4"], "_mm"),
+    "moving, 8 (x)": lambda task: _gain(task["depth"]["moving"]["8"], "_mm"),
+    "near, 8 (x)": lambda task: _gain(task["depth"]["near"]["8"], "_mm"),
+    "all pixels, 8 (x)": lambda task: _gain(task["depth"]["valid"]["8"], "_mm"),
+    "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"]),
     "AUC within 5": lambda task: task["termination"]["5"]["auc"],
     "Q R2": lambda task: task["value"]["r2"],
     "Q slope": lambda task: task["value"]["slope"],

@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from egovcp.entry_point import INTERRUPTED
 from egovcp.errors import EnvironmentFailure
 from egovcp.workers import stop_on_signal
-from egovcp_experiment.cell import Cell, Record, in_order
-from egovcp_experiment.local_runner import INTERRUPTED, LocalProcess, LocalRunner, machine
+from egovcp_experiment.cell import Cell, in_order
+from egovcp_experiment.local_runner import CellProcess, machine
 from egovcp_experiment.store import CellStore
 
 _POLL_S: Final = 0.05
-
-
-@dataclass
-class _Running:
-    """A cell whose command runs."""
-
-    cell: Cell
-    argv: list[str]
-    run: LocalProcess
-    start: float
 
 
 class CellScheduler:
@@ -40,24 +30,19 @@ class CellScheduler:
     """
 
     def __init__(
-        self,
-        cells: Sequence[Cell],
-        store: CellStore,
-        jobs: int = 1,
-        log: Callable[[str], None] = print,
+        self, cells: Sequence[Cell], store: CellStore, jobs: int, log: Callable[[str], None]
     ) -> None:
         self._cells = in_order(cells)
         self._store, self._jobs, self._log = store, jobs, log
-        self._runner = LocalRunner(jobs)
-        self.records: dict[str, Record] = {}
+        self.records = store.records
         self.failed: dict[str, str] = {}
-        self._running: list[_Running] = []
+        self._running: list[CellProcess] = []
         self._stopping = False
         for cell in self._cells:  # refuses other settings before anything runs
             if self._has_inputs(cell):
-                self._load(cell)
+                store.load(cell)
 
-    def run(self) -> Mapping[str, Record]:
+    def run(self) -> None:
         """Run what is missing; a failed cell stops only the cells that need it.
 
         Raises:
@@ -73,25 +58,18 @@ class CellScheduler:
                 if stopped:
                     self._stop(stopped)
             finally:
-                for running in self._running:
-                    running.run.kill()
+                for process in self._running:
+                    process.kill()
                 self._running = []
         if self.failed:
             raise EnvironmentFailure(self._failure_message())
-        return self.records
 
     def _has_inputs(self, cell: Cell) -> bool:
         return all(name in self.records for name in cell.needs)
 
-    def _load(self, cell: Cell) -> bool:
-        record = self._store.load(cell, self.records)
-        if record is not None:
-            self.records[cell.name] = record
-        return record is not None
-
     def _ready(self) -> list[Cell]:
         """Cells that could start now, exclusive ones last: they wait for all others."""
-        done = {*self.records, *self.failed, *(running.cell.name for running in self._running)}
+        done = {*self.records, *self.failed, *(process.cell.name for process in self._running)}
         ready = [c for c in self._cells if c.name not in done and self._has_inputs(c)]
         return sorted(ready, key=lambda cell: cell.command.exclusive)
 
@@ -100,32 +78,33 @@ class CellScheduler:
         for cell in self._ready():
             if not self._has_room(cell):
                 return True
-            if not self._load(cell):
-                argv = self._store.prepare(cell, self.records)
+            if not self._store.load(cell):
+                argv = self._store.prepare(cell)
                 self._progress(cell, "begins")
-                run = self._runner.start(cell.command, argv, self._store.log(cell))
-                self._running.append(_Running(cell, argv, run, time.monotonic()))
+                used = {process.slot for process in self._running}
+                slot = next(k for k in range(self._jobs) if k not in used)
+                log = self._store.log(cell)
+                self._running.append(CellProcess(cell, argv, log, slot, self._jobs))
         return bool(self._ready())
 
     def _has_room(self, cell: Cell) -> bool:
-        busy = [running.cell.command for running in self._running]
+        busy = [process.cell.command for process in self._running]
         if cell.command.exclusive or any(command.exclusive for command in busy):
             return not busy
         return len(busy) < self._jobs
 
     def _collect(self) -> None:
         """Store the results of commands that have ended."""
-        for running in list(self._running):
-            cell, code = running.cell, running.run.ended()
+        for process in list(self._running):
+            cell, code = process.cell, process.ended()
             if code is None:
                 continue
-            self._running.remove(running)
-            minutes = (time.monotonic() - running.start) / 60.0
+            self._running.remove(process)
+            minutes = process.minutes
             if code == 0:
                 date = datetime.now(UTC).isoformat(timespec="seconds")
                 facts = {"minutes": minutes, "date": date, **machine()}
-                record = self._store.save(cell, self.records, running.argv, facts)
-                self.records[cell.name] = record
+                self._store.save(cell, process.argv, facts)
                 self._progress(cell, f"done in {minutes:.1f} min")
             elif code == INTERRUPTED and self._stopping:
                 self._progress(cell, f"stopped after {minutes:.1f} min")
@@ -143,8 +122,8 @@ class CellScheduler:
         """Interrupt all commands and wait for them, until a second signal."""
         self._stopping = True
         self._log(f"stopping {len(self._running)} processes; once more to kill them")
-        for running in self._running:
-            running.run.interrupt()
+        for process in self._running:
+            process.interrupt()
         while self._running and len(stopped) < 2:
             self._collect()
             time.sleep(_POLL_S)

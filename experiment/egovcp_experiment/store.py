@@ -11,14 +11,17 @@ import hashlib
 import json
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.destination import writer_lock
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.files import write_json
+from egovcp.values import differences
 from egovcp_experiment.cell import (
     Cell,
     CellFigure,
@@ -41,6 +44,8 @@ class CellStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.records: dict[str, Record] = {}
+        """The known results by name of the cell."""
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -68,34 +73,39 @@ class CellStore:
         """The log file of a cell."""
         return self.folder / "logs" / f"{cell.name}.log"
 
-    def load(self, cell: Cell, known: Mapping[str, Record]) -> Record | None:
-        """The result of a cell, or None; ``known`` are those of the cells that it needs.
+    def load(self, cell: Cell) -> bool:
+        """Read the result of a cell into `records`, after those of the cells that it needs; returns
+        whether it exists.
 
         Raises:
             UsageError: the stored result has other settings.
         """
         path = self._path(cell)
         if not path.exists():
-            return None
+            return False
         record: Record = read_json(path)
-        settings = self.settings(cell, known)
+        settings = self.settings(cell)
         if record["settings"] != settings:
+            name, (before, now) = next(differences(record["settings"], settings))
             raise UsageError(
-                f"{path} was made with other settings: {_difference(record['settings'], settings)}"
-                "; name another --output_dir, or remove that file to run the cell again"
+                f"{path} was made with other settings: {name} was {json.dumps(before)}, is "
+                f"{json.dumps(now)}; name another --output_dir, or remove that file to run the "
+                "cell again"
             )
-        return record
+        self.records[cell.name] = record
+        return True
 
-    def settings(self, cell: Cell, known: Mapping[str, Record]) -> dict[str, Any]:
+    def settings(self, cell: Cell) -> dict[str, Any]:
         """All that the figures of a cell depend on; folders are identified by their hashes."""
 
         def identity(reference: Reference) -> Any:
-            if isinstance(reference, CellOutput):
-                digest = known[reference.cell]["sha256"]
-                return {"cell": reference.cell, "path": reference.path, "sha256": digest}
-            if isinstance(reference, ExternalPath):
-                return {"sha256": external_digest(reference.path)}
-            return _figure(known, reference)
+            match reference:
+                case CellOutput(name, path):
+                    return {"cell": name, "path": path, "sha256": self.records[name]["sha256"]}
+                case ExternalPath(path):
+                    return {"sha256": external_digest(path)}
+                case CellFigure():
+                    return self._figure(reference)
 
         settings = {
             "module": cell.command.module,
@@ -106,15 +116,17 @@ class CellStore:
         through_json: dict[str, Any] = json.loads(json.dumps(settings))
         return through_json
 
-    def prepare(self, cell: Cell, known: Mapping[str, Record]) -> list[str]:
+    def prepare(self, cell: Cell) -> list[str]:
         """Arguments of a cell's command; an interrupted run is resumed, or else removed."""
 
         def location(reference: Reference) -> Any:
-            if isinstance(reference, CellOutput):
-                return str(self._work(reference.cell) / reference.path)
-            if isinstance(reference, ExternalPath):
-                return reference.path
-            return _figure(known, reference)
+            match reference:
+                case CellOutput(name, path):
+                    return str(self._work(name) / path)
+                case ExternalPath(path):
+                    return path
+                case CellFigure():
+                    return self._figure(reference)
 
         work = self._work(cell.name)
         resume_flags = cell.command.resume_flags(work)
@@ -125,11 +137,9 @@ class CellStore:
         flags = {cell.command.output: str(work), **resolve(cell.flags, location)}
         return [*to_argv({**flags, **(resume_flags or {})}), *cell.extra]
 
-    def save(
-        self, cell: Cell, known: Mapping[str, Record], argv: list[str], facts: Mapping[str, Any]
-    ) -> Record:
+    def save(self, cell: Cell, argv: Sequence[str], facts: Mapping[str, Any]) -> None:
         """Write the result of a cell whose command has succeeded, with ``facts`` of the run."""
-        settings = self.settings(cell, known)
+        settings = self.settings(cell)
         work = self._work(cell.name)
         text = json.dumps(settings, sort_keys=True)
         record = {
@@ -137,12 +147,12 @@ class CellStore:
             "settings": settings,
             "settings_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "sha256": cell.command.digest(work),
-            "command": f"{cell.command.shell_name} {shlex.join(argv)}",
+            "command": f"{cell.command.prog} {shlex.join(argv)}",
             **facts,
             "figures": cell.command.figures(work),
         }
         write_json(self._path(cell), record)
-        return record
+        self.records[cell.name] = record
 
     def _path(self, cell: Cell) -> Path:
         return self.folder / _CELLS / f"{cell.name}.json"
@@ -150,19 +160,5 @@ class CellStore:
     def _work(self, name: str) -> Path:
         return self.folder / "work" / name
 
-
-def _figure(known: Mapping[str, Record], reference: CellFigure) -> Any:
-    value: Any = known[reference.cell]["figures"]
-    for key in reference.keys:
-        value = value[key]
-    return value
-
-
-def _difference(before: Any, now: Any, place: str = "") -> str:
-    """The first value that differs, ``flags.steps was 600, is 800``."""
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in dict.fromkeys([*before, *now]):
-            if before.get(name) != now.get(name):
-                inner = f"{place}.{name}" if place else name
-                return _difference(before.get(name), now.get(name), inner)
-    return f"{place} was {json.dumps(before)}, is {json.dumps(now)}"
+    def _figure(self, reference: CellFigure) -> Any:
+        return reduce(getitem, reference.keys, self.records[reference.cell]["figures"])

@@ -4,6 +4,7 @@ import copy
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from multiprocessing import Pipe
 
 import numpy as np
 import pytest
@@ -25,6 +26,11 @@ class _Worker:
     def __init__(self, behaviour: Behaviour) -> None:
         self._behaviour = behaviour
         self._todo: list[int] = []
+        self._pipe, remote = Pipe()
+        remote.close()  # the other end is always ready
+        self.waitables = [self._pipe]
+        self.unfinished: dict[int, Scenario] = {}
+        self.last_report = time.monotonic()
         self.alive = True
         self.hung = False
         self.killed = False
@@ -46,29 +52,23 @@ class _Worker:
         self.alive, self.killed = False, True
 
 
-class _Group:
-    def __init__(self, behaviour: Behaviour) -> None:
-        self._behaviour = behaviour
-        self.workers: list[_Worker] = []
+def _run(
+    behaviour: Behaviour, episodes: int = 20, workers: int = 2
+) -> tuple[list[int], list[_Worker]]:
+    """Numbers of the finished episodes in order, and all workers that were started."""
+    started: list[_Worker] = []
 
-    def start(self) -> _Worker:
-        self.workers.append(_Worker(self._behaviour))
-        return self.workers[-1]
+    def start() -> _Worker:
+        started.append(_Worker(behaviour))
+        return started[-1]
 
-    def wait(self, seconds: float) -> None:
-        time.sleep(0.001)
-
-
-def _run(behaviour: Behaviour, episodes: int = 20, workers: int = 2) -> tuple[list[int], _Group]:
-    """Numbers of the finished episodes in order, and the group of workers."""
-    group = _Group(behaviour)
     scenarios = [Scenario("ball", 0, i) for i in range(episodes)]
     numbers: list[int] = []
-    with closing(WorkerPool(group, workers, scenarios, _NUM_ENVS, timeout=0.05)) as pool:
+    with closing(WorkerPool(start, workers, scenarios, _NUM_ENVS, timeout=0.05)) as pool:
         while not pool.done:
             for report in pool.poll():
                 numbers += report.finished
-    return numbers, group
+    return numbers, started
 
 
 def _once(what: Callable[[_Worker], WorkerReport | None], at: int) -> Behaviour:
@@ -99,10 +99,10 @@ def _normal(worker: _Worker, number: int) -> None:
 @pytest.mark.parametrize("episodes", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_every_episode_is_finished_once(episodes: int, workers: int) -> None:
-    numbers, group = _run(_normal, episodes, workers)
+    numbers, started = _run(_normal, episodes, workers)
     assert sorted(numbers) == list(range(episodes))
-    assert len(group.workers) <= workers
-    assert all(worker.killed for worker in group.workers)
+    assert len(started) <= workers
+    assert all(worker.killed for worker in started)
 
 
 @pytest.mark.parametrize("fault", [_die, _hang])
@@ -110,9 +110,9 @@ def test_every_episode_is_finished_once(episodes: int, workers: int) -> None:
 def test_a_lost_worker_is_replaced_and_its_episodes_are_repeated(
     fault: Callable[[_Worker], None], at: int
 ) -> None:
-    numbers, group = _run(_once(fault, at))
+    numbers, started = _run(_once(fault, at))
     assert sorted(numbers) == list(range(20))
-    assert len(group.workers) == 3
+    assert len(started) == 3
 
 
 def test_an_episode_that_kills_every_worker_raises() -> None:
@@ -135,9 +135,9 @@ def test_an_episode_that_always_hangs_raises() -> None:
 
 def test_an_invalid_episode_is_repeated_once() -> None:
     broken = DataError("episode 7, frame 3: state is not finite")
-    numbers, group = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
+    numbers, started = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
     assert sorted(numbers) == list(range(20))
-    assert len(group.workers) == 3
+    assert len(started) == 3
 
 
 def test_an_episode_that_stays_invalid_raises() -> None:
@@ -166,9 +166,9 @@ def test_invalid_episodes_of_one_worker_are_counted_separately() -> None:
         failed.append(number)
         return WorkerReport(0, error=_invalid(number))
 
-    numbers, group = _run(behaviour, workers=1)
+    numbers, started = _run(behaviour, workers=1)
     assert sorted(numbers) == list(range(20))
-    assert len(group.workers) == 3
+    assert len(started) == 3
 
 
 def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
@@ -184,9 +184,9 @@ def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
         worker.alive = False
         return None
 
-    numbers, group = _run(behaviour)
+    numbers, started = _run(behaviour)
     assert sorted(numbers) == list(range(20))
-    assert len(group.workers) == 4
+    assert len(started) == 4
 
 
 def test_the_number_of_an_invalid_episode_is_pickled_with_the_error() -> None:

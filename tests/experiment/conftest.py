@@ -55,6 +55,7 @@ def cell(tmp_path: Path, diary: Path, monkeypatch: pytest.MonkeyPatch) -> MakeCe
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     tool = CellCommand(
         module="quick_command",
+        prog="quick",
         output="output_dir",
         figures=lambda folder: dict(read_json(folder / "result.json")),
         digest=lambda folder: sha256(folder / "result.json"),

@@ -17,7 +17,7 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
     out = capsys.readouterr().out
     for name, experiment in EXPERIMENTS.items():
         assert name in out
-        assert experiment.SUMMARY in out
+        assert experiment.summary in out
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from egovcp_experiment.config import (
     TrainingConfig,
 )
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.grid import ALL, Grid, Model, Variant
+from egovcp_experiment.grid import ALL, Grid, Model
 
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
@@ -48,10 +48,9 @@ def names(cells: Iterable[Cell]) -> list[str]:
 
 def test_variants_share_data_and_models() -> None:
     grid = Grid(ExperimentConfig(train=TrainingConfig(seeds=(0, 1))))
-    for seed in (0, 1):
-        grid.play("ball", seed, Variant("plain"))
-        grid.play("ball", seed, Variant("long", play={"planner.horizon": 6}))
-        grid.play("ball", seed, Variant("other", Model("other", {"policy.hidden": 64})))
+    grid.plays("ball")
+    grid.plays("ball", "long", {"planner.horizon": 6})
+    grid.plays("ball", "other", model=Model("other", {"policy.hidden": 64}))
     commands = [cell.command for cell in grid.cells]
     assert (commands.count(COLLECT), commands.count(TRAIN), commands.count(PLAY)) == (1, 4, 6)
     assert in_order(grid.cells) == tuple(grid.cells)
@@ -72,8 +71,8 @@ def test_all_experiments_share_the_default_evaluation() -> None:
 def test_existing_data_and_policies_are_used() -> None:
     data = DataConfig(roots={"ball": "data/ball"})
     grid = Grid(ExperimentConfig(data=data, train=TrainingConfig(policies={"wall": "a/wall"})))
-    grid.play("ball", 0, Variant("plain"))
-    grid.play("wall", 0, Variant("plain"))
+    grid.plays("ball")
+    grid.plays("wall")
     assert names(grid.cells) == [
         "train-ball-default-s0",
         "play-ball-default-s0",
@@ -85,7 +84,7 @@ def test_existing_data_and_policies_are_used() -> None:
 
 def test_the_multitask_model_reads_the_data_of_all_tasks() -> None:
     grid = Grid(ExperimentConfig())
-    grid.play("ball", 0, Variant("mixed"), trained_on=ALL)
+    grid.plays("ball", "mixed", trained_on=ALL)
     train = next(cell for cell in grid.cells if cell.command is TRAIN)
     names = ("collect-ball-1334", "collect-wall-1334", "collect-arch-870")
     assert train.flags["datasets"] == [{"root": CellOutput(name)} for name in names]

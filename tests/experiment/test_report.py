@@ -26,7 +26,7 @@ RECORD: dict[str, Any] = {
 def _report() -> ExperimentReport:
     plot = draw("curve", "a curve & more", lambda figure: figure.subplots().plot([1, 2]))
     table = Table("rows", ("name", "value"), (("a|b", "`x<1`"),))
-    return ExperimentReport("Title <1>", ("ours is **worse**",), ("text", table, plot), {"x": 1.5})
+    return ExperimentReport("Title <1>", ["ours is **worse**"], ["text", table, plot], {"x": 1.5})
 
 
 def _publish(folder: Path, scale: str = "small", missing: tuple[str, ...] = ()) -> None:

@@ -51,13 +51,12 @@ def run_audit(config: AuditConfig) -> None:
         spread = np.linspace(0, total - 1, min(config.count, total)).round()
         selected = np.unique(spread.astype(int))
     episodes = selected.tolist()
-    different: list[int] = []
-    for index, episode in tqdm(
-        resimulate(reader, episodes), total=len(episodes), unit="ep", delay=1
-    ):
-        if episode.digest() != (reader.digest(index) or reader.read(index).digest()):
-            different.append(index)
-    different.sort()
+    simulated = tqdm(resimulate(reader, episodes), total=len(episodes), unit="ep", delay=1)
+    different = sorted(
+        index
+        for index, episode in simulated
+        if episode.digest() != (reader.digest(index) or reader.read(index).digest())
+    )
     versions = changed_versions(reader, episodes)
     result = {"ok": not different, "episodes": episodes, "different": different}
     write_report(config.json, {**result, "versions": versions})

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from huggingface_hub import DatasetCard, DatasetCardData
 
@@ -15,13 +15,14 @@ from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
 from egovcp.files import write_text
+from egovcp.help_text import field_docs
 from egovcp.outputs import output_file
+from egovcp.sim.config import BaseEnvConfig, EnvConfig
 from egovcp.sim.tasks.registry import describe_task
 from egovcp.terminal import echo
-from egovcp_collect.dataset import card_tables
-from egovcp_collect.dataset.coverage import assess, summary
+from egovcp_collect.dataset.coverage import assess, coverage_column, summary
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
-from egovcp_collect.dataset.statistics import DatasetStatistics, compute_statistics
+from egovcp_collect.dataset.statistics import DatasetStatistics, TaskStatistics, compute_statistics
 
 CARD: Final = "README.md"
 ASSETS: Final = "assets"
@@ -75,10 +76,17 @@ def _render(
     provenance = reader.provenance
     config, versions = provenance.get("config", {}), provenance.get("versions", {})
     shortest, longest = config.get("step_ticks", (1, 1))
-    ranges, constants = card_tables.settings_tables(config, tasks)
+    ranges, constants = settings_tables(config, tasks)
     checks = assess(statistics)
     card = DatasetCard.from_template(
-        _front_matter(name, reader.num_frames),
+        DatasetCardData(
+            license="apache-2.0",
+            task_categories=["robotics"],
+            tags=["LeRobot", "egovcp", "unitree_g1", "humanoid", "depth", "world-model"],
+            size_categories=[_size_category(reader.num_frames)],
+            pretty_name=name.partition("/")[2],
+            configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+        ),
         template_str=(files(__package__) / "card_template.md").read_text(encoding="utf-8"),
         title=f"{name.partition('/')[2]}: Unitree G1, {', '.join(tasks)}",
         tasks=[{"name": task, "about": describe_task(task)} for task in tasks],
@@ -96,8 +104,8 @@ def _render(
         step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
         ranges=ranges,
         constants=constants,
-        coverage=card_tables.coverage_table(statistics.tasks),
-        events=card_tables.event_table(statistics.tasks),
+        coverage=coverage_table(statistics.tasks),
+        events=event_table(statistics.tasks),
         plots=plots,
         assessment=summary(checks),
         failed=[check for check in checks if not check.passed],
@@ -108,18 +116,73 @@ def _render(
     return f"{str(card).rstrip()}\n"
 
 
-def _front_matter(name: str, frames: int) -> DatasetCardData:
-    return DatasetCardData(
-        license="apache-2.0",
-        task_categories=["robotics"],
-        tags=["LeRobot", "egovcp", "unitree_g1", "humanoid", "depth", "world-model"],
-        size_categories=[_size_category(frames)],
-        pretty_name=name.partition("/")[2],
-        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
-    )
-
-
 def _size_category(rows: int) -> str:
     """The Hub's name for a number of rows."""
     bounds = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
     return next((name for bound, name in bounds.items() if rows < bound), "1M<n<10M")
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table; pipes in cells are escaped."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(
+        f"| {' | '.join(str(cell).replace('|', r'\|') for cell in line)} |" for line in lines
+    )
+
+
+def settings_tables(config: Mapping[str, Any], tasks: Sequence[str]) -> tuple[str, str]:
+    """Parameters drawn per episode, and constant ones, of a recorded configuration."""
+    drawn, constant = [], []
+    for name, value, meaning in _settings(config.get("env", {}), tasks):
+        if isinstance(value, list) and len(value) == 2:  # a range
+            low, high = value
+            if low != high:
+                drawn.append((f"`env.{name}`", _format(low), _format(high), meaning))
+                continue
+            value = low
+        constant.append((f"`env.{name}`", _format(value), meaning))
+    head = ("parameter", "from", "to", "meaning")
+    return markdown_table(head, drawn), markdown_table(("parameter", "value", "meaning"), constant)
+
+
+def _settings(env: Mapping[str, Any], tasks: Sequence[str]) -> Iterator[tuple[str, Any, str]]:
+    """Dotted name, value and documentation of the settings of these tasks.
+
+    Options unknown to this version get an empty description.
+    """
+    defaults, docs = EnvConfig(), dict(field_docs(EnvConfig))
+    general = {option.name for option in fields(BaseEnvConfig)}
+    for group, value in env.items():
+        own = group in general or group.removesuffix("_episode") in tasks
+        if group == "threads" or (isinstance(value, Mapping) and not own):
+            continue
+        if not isinstance(value, Mapping):
+            yield group, value, docs.get(group, "")
+            continue
+        kind = type(getattr(defaults, group, None))
+        group_docs = dict(field_docs(kind)) if is_dataclass(kind) else {}
+        for name, setting in value.items():
+            yield f"{group}.{name}", setting, group_docs.get(name, "")
+
+
+def _format(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return ", ".join(map(_format, value)) if isinstance(value, list) else str(value)
+
+
+def coverage_table(tasks: Sequence[TaskStatistics]) -> str:
+    """Statistics, one column per task."""
+    columns = [coverage_column(task) for task in tasks]
+    rows = [(name, *(column[name] for column in columns)) for name in columns[0]]
+    return markdown_table(("", *(task.task for task in tasks)), rows)
+
+
+def event_table(tasks: Sequence[TaskStatistics]) -> str:
+    """Rate of each reward term."""
+    rows = [
+        (task.task, f"`{name}`", f"{rate.per_1000_steps:.2f}", f"{rate.episode_share:.1%}")
+        for task in tasks
+        for name, rate in task.events.items()
+    ]
+    return markdown_table(("task", "term", "ticks per 1000 steps", "episodes"), rows)

@@ -12,14 +12,9 @@ from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
-from egovcp_collect.dataset.card_tables import coverage_column
 from egovcp_collect.dataset.feature_coverage import report_features
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
-from egovcp_collect.dataset.statistics import (
-    DatasetStatistics,
-    TaskStatistics,
-    compute_statistics,
-)
+from egovcp_collect.dataset.statistics import DatasetStatistics, TaskStatistics, compute_statistics
 
 
 @dataclass(frozen=True)
@@ -77,11 +72,8 @@ def run_coverage(config: CoverageConfig) -> None:
     if config.output_dir:
         require_matplotlib()
     root = locate(config.dataset).root
-    if not is_own(root):
-        write_report(config.json, report_features(LeRobotReader.open(root)))
-        return
-    reader = DatasetReader.open(config.dataset)
-    if not reader.robot.is_g1:
+    reader = DatasetReader.open(config.dataset) if is_own(root) else None
+    if reader is None or not reader.robot.is_g1:
         write_report(config.json, report_features(LeRobotReader.open(root)))
         return
     statistics = compute_statistics(reader, config.returns)
@@ -103,6 +95,28 @@ def run_coverage(config: CoverageConfig) -> None:
     }
     tasks = {task.task: asdict(task) for task in statistics.tasks}
     write_report(config.json, {"tasks": tasks, "assessment": assessment})
+
+
+def coverage_column(task: TaskStatistics) -> dict[str, str]:
+    """Statistics of one task: name -> text."""
+    r, d, length = task.returns, task.depth, task.length
+    return {
+        "episodes": f"{task.episodes}",
+        "steps": f"{task.steps} ({task.step_share:.0%})",
+        "ticks per episode": f"{length.low:.0f} to {length.high:.0f}" if length else "none",
+        "episodes that succeed": f"{task.success_share:.1%}",
+        "episodes that end in a fall": f"{task.fall_share:.1%}",
+        f"return (gamma {r.gamma:g}, {r.steps} ticks), mean and std": (
+            f"{r.spread.mean:.3f}, {r.spread.std:.3f}" if r.spread else "none"
+        ),
+        "return, 5 % to 95 %": f"{r.spread.q05:.3f} to {r.spread.q95:.3f}" if r.spread else "none",
+        "frames with a reward event within the return horizon": f"{r.positive_share:.1%}",
+        "frames with a cost event within the return horizon": f"{r.negative_share:.1%}",
+        "visited cells of the hand workspace": ", ".join(
+            f"{hand} {share:.0%}" for hand, share in task.action.occupied.items()
+        ),
+        "depth pixels measured, nearer than 1 m": f"{d.valid_share:.0%}, {d.near_share:.1%}",
+    }
 
 
 def _describe(task: TaskStatistics) -> Iterator[str]:

@@ -60,21 +60,20 @@ class SplitConfig:
 
 def run_delete(config: DeleteConfig) -> None:
     """Write the new dataset."""
-    root = locate(config.dataset).root
-    count = _count(root)
+    reader, count = _open(config.dataset)
     if not config.episodes:
         raise UsageError("which episodes shall be left out? give --episodes='[3, 7]'")
     left_out = select_episodes(config.episodes, count, "--episodes").tolist()
     kept = sorted(set(range(count)) - set(left_out))
     if not kept:
         raise UsageError(f"--episodes={config.episodes} leaves no episode of {count}")
-    write_report(config.json, _write(root, kept, config.output_dir))
+    write_report(config.json, _write(reader, kept, config.output_dir))
 
 
 def run_split(config: SplitConfig) -> None:
     """Write the new datasets."""
-    root = locate(config.dataset).root
-    count, total = _count(root), sum(config.splits.values())
+    reader, count = _open(config.dataset)
+    total = sum(config.splits.values())
     names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
     shares = all(0 < share <= 1 for share in config.splits.values())
     if not (config.splits and names and shares and total <= 1 + 1e-9):
@@ -91,33 +90,32 @@ def run_split(config: SplitConfig) -> None:
             raise UsageError(f"--splits: {name} would have none of the {count} episodes")
         kept = sorted(order[first:end].tolist())
         output = str(Path(config.output_dir) / name) if config.output_dir else ""
-        result[name], first = _write(root, kept, output), end
+        result[name], first = _write(reader, kept, output), end
     write_report(config.json, result)
 
 
-def _count(root: Path) -> int:
-    """Number of episodes of a dataset with sound tables; prints what will not be checked."""
+def _open(config: DatasetConfig) -> tuple[DatasetReader | LeRobotReader, int]:
+    """A dataset with sound tables, and its number of episodes; prints what is not checked."""
+    root = locate(config).root
     if is_own(root):
-        return len(DatasetReader.open(_folder(root)))
+        own = DatasetReader.open(config)
+        return own, len(own)
     reader = LeRobotReader.open(root)
     echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
-    return len(reader.rows)
+    return reader, len(reader.rows)
 
 
-def _folder(root: Path) -> DatasetConfig:
-    return DatasetConfig(root=str(root))
-
-
-def _write(root: Path, kept: Sequence[int], output_dir: str) -> dict[str, int]:
+def _write(
+    reader: DatasetReader | LeRobotReader, kept: Sequence[int], output_dir: str
+) -> dict[str, int]:
     """Write the episodes to the new dataset ``output_dir``."""
-    output = new_folder(output_dir, [root])
-    if is_own(root):
-        reader = DatasetReader.open(_folder(root))
+    output = new_folder(output_dir, [reader.root])
+    if isinstance(reader, DatasetReader):
         with DatasetWriter(output, reader.origin) as writer:
             for index in tqdm(kept, unit="ep", delay=1):
                 writer.add(reader.read(index))
         episodes, frames = len(kept), writer.num_frames
     else:
-        episodes, frames = write_subset(LeRobotReader.open(root), kept, output)
+        episodes, frames = write_subset(reader, kept, output)
     echo(f"{output}: {episodes} episodes, {frames} frames")
     return {"episodes": episodes, "frames": frames}

@@ -25,7 +25,13 @@ def report_features(reader: LeRobotReader) -> dict[str, Any]:
         DataError: a file is damaged.
     """
     lengths = np.array([row.length for row in reader.rows]) / reader.fps
-    features = {key: _by_value(reader, key, value) for key, value in _statistics(reader).items()}
+    features = {
+        key: {
+            reader.features[key].label(i): {name: float(value[i]) for name, value in found.items()}
+            for i in range(reader.features[key].size)
+        }
+        for key, found in _statistics(reader).items()
+    }
     echo(f"{reader.root}: {len(lengths)} episodes, {reader.num_frames} frames\n")
     spread = Distribution.of(lengths)
     if spread is not None:
@@ -46,20 +52,17 @@ def report_features(reader: LeRobotReader) -> dict[str, Any]:
     if short := int((lengths < _SHORT_S).sum()):
         warnings.append(f"{short} episodes are shorter than {_SHORT_S:g} s")
     missing = [key for key in ("action", "observation.state") if key not in reader.features]
-    notes = ["cameras: their pixels are not read"] if _cameras(reader) else []
+    cameras = any(feature.is_camera for feature in reader.features.values())
+    notes = ["cameras: their pixels are not read"] if cameras else []
     notes += [f"{key}: the dataset has none" for key in missing]
     if "next.reward" not in reader.features:
         notes.append("events, returns and success: there is no next.reward")
     echo("\nassessment")
-    found = [f"warning: {text}" for text in warnings]
-    found = found or ["no value is constant, and no episode is short"]
-    echo_lines(f"  {line}" for line in [*found, *(f"not assessed: {note}" for note in notes)])
+    lines = [f"warning: {text}" for text in warnings]
+    lines = lines or ["no value is constant, and no episode is short"]
+    echo_lines(f"  {line}" for line in [*lines, *(f"not assessed: {note}" for note in notes)])
     length = asdict(spread) if spread is not None else None
     return {"length_s": length, "features": features, "warnings": warnings, "not_assessed": notes}
-
-
-def _cameras(reader: LeRobotReader) -> list[str]:
-    return [key for key, feature in reader.features.items() if feature.is_camera]
 
 
 def _statistics(reader: LeRobotReader) -> dict[str, Statistics]:
@@ -79,11 +82,3 @@ def _statistics(reader: LeRobotReader) -> dict[str, Statistics]:
                     raise DataError.at(path, problem, number) from error
                 parts[feature.key].append((len(table), describe(values)))
     return {key: aggregate_named(found) for key, found in parts.items() if found}
-
-
-def _by_value(reader: LeRobotReader, key: str, found: Statistics) -> dict[str, dict[str, float]]:
-    feature = reader.features[key]
-    return {
-        feature.label(i): {name: float(value[i]) for name, value in found.items()}
-        for i in range(feature.size)
-    }

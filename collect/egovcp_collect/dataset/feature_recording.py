@@ -45,21 +45,17 @@ def record_features(reader: LeRobotReader, row: EpisodeRow, output: Path) -> lis
     return [*features]
 
 
-def _columns(times: NDArray[np.float64]) -> list[Any]:
-    return [
-        rr.TimeColumn("frame", sequence=np.arange(len(times))),
-        rr.TimeColumn("time", duration=times),
-    ]
-
-
 def _log_values(
     stream: rr.RecordingStream, feature: Feature, values: NDArray[Any], times: NDArray[np.float64]
 ) -> None:
     path = feature.key.replace(".", "/")
     names = [feature.label(i).removeprefix(feature.key) for i in range(feature.size)]
     stream.log(path, rr.SeriesLines(names=[name.strip() or path for name in names]), static=True)
-    scalars = rr.Scalars.columns(scalars=values.astype(np.float64))
-    stream.send_columns(path, _columns(times), scalars)
+    index = [
+        rr.TimeColumn("frame", sequence=np.arange(len(times))),
+        rr.TimeColumn("time", duration=times),
+    ]
+    stream.send_columns(path, index, rr.Scalars.columns(scalars=values.astype(np.float64)))
 
 
 def _log_camera(

@@ -39,10 +39,8 @@ def require_matplotlib() -> None:
 def draw_figures(statistics: DatasetStatistics, returns: ReturnConfig, folder: Path) -> list[Path]:
     """Write ``events.png``, ``returns.png``, ``actions.png`` and ``depth.png``; return the paths.
 
-    Raises:
-        MissingPackage: matplotlib is not installed.
+    Call `require_matplotlib` before.
     """
-    require_matplotlib()
     folder.mkdir(parents=True, exist_ok=True)
     figures = {
         "events.png": _events(statistics.tasks),
@@ -57,12 +55,9 @@ def draw_figures(statistics: DatasetStatistics, returns: ReturnConfig, folder: P
 
 
 def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # draws without a display, unlike pyplot
 
-    figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)  # draws without a display
-    return figure
+    return Figure(figsize=(width, height), facecolor="white", layout="constrained")
 
 
 def _label(axes: Any, x: str = "", y: str = "", title: str = "", legend: bool = False) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +75,10 @@ class RecordIndex:
     """The records of a dataset and of those that its episodes were taken from."""
 
     provenance: Provenance
-    by_digest: Mapping[str, Record]
-    """`Episode.digest` -> record, of all datasets."""
-    by_number: Mapping[int, Record] = field(default_factory=dict)
-    """Index -> record, for records of the dataset without a digest (collection version 1)."""
-    recorded: int = 0
+    records: Mapping[str | int, Record]
+    """`Episode.digest` -> record, of all datasets; index -> record, for records of the dataset
+    without a digest (collection version 1)."""
+    recorded: int
     """Episodes that the dataset itself recorded."""
 
     @classmethod
@@ -91,25 +90,21 @@ class RecordIndex:
         """
         own = _read_damaged(root, required=not originals)
         datasets = [*([own] if own else []), *(_read_original(path) for path in originals)]
-        require_one_controller({path: known.controller_id for path, known, _ in datasets})
+        require_one_controller({path: origin.controller_id for path, origin, _ in datasets})
         provenances = [provenance for _, provenance, _ in datasets]
-        by_digest: dict[str, Record] = {}
-        by_number: dict[int, Record] = {}
+        known: dict[str | int, Record] = {}
         for index, (_, _, records) in enumerate(datasets):
             for number, record in enumerate(records):
-                if not record:
-                    continue
-                joined = join_metadata(record.get("metadata", {}), provenances, index)
-                if record.get("sha256"):
-                    by_digest.setdefault(record["sha256"], {**record, "metadata": joined})
-                else:
-                    by_number[number] = {**record, "metadata": joined}
+                if record:
+                    joined = join_metadata(record.get("metadata", {}), provenances, index)
+                    key = record.get("sha256") or number
+                    known.setdefault(key, {**record, "metadata": joined})
         provenance = join_provenance(provenances, command)
-        return cls(provenance, by_digest, by_number, len(own[2]) if own else 0)
+        return cls(provenance, known, len(own[2]) if own else 0)
 
     def find(self, digest: str, number: int) -> Record | None:
         """The record of an episode, or None."""
-        return self.by_digest.get(digest) or self.by_number.get(number)
+        return self.records.get(digest) or self.records.get(number)
 
 
 type _Dataset = tuple[Path, Provenance, Sequence[Record]]
@@ -134,11 +129,9 @@ def _read_damaged(root: Path, required: bool) -> _Dataset | None:
             f"{error}; give the dataset that the episodes were taken from: --records=ORIGINAL"
         ) from error
     records = content.get("episodes")
-    return (root, provenance, [_valid(r) for r in records] if isinstance(records, list) else [])
-
-
-def _valid(record: object) -> Record:
-    return record if isinstance(record, dict) and not list(record_problems(record)) else {}
+    records = records if isinstance(records, list) else []
+    valid = [isinstance(r, dict) and not list(record_problems(r)) for r in records]
+    return root, provenance, [r if ok else {} for r, ok in zip(records, valid, strict=True)]
 
 
 def _read_original(root: Path) -> _Dataset:

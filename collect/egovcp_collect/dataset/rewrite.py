@@ -6,7 +6,6 @@ import itertools
 import os
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -32,7 +31,7 @@ from egovcp_collect.dataset.record_index import (
     require_one_controller,
 )
 from egovcp_collect.dataset.recovery import RecoveredEpisode, recover_episodes
-from egovcp_collect.dataset.subset import EpisodeScan, SubsetWriter
+from egovcp_collect.dataset.subset import SubsetWriter, scan_episodes
 
 
 @dataclass(frozen=True)
@@ -158,23 +157,46 @@ def run_repair(config: RepairConfig) -> None:
         Path(os.path.expanduser(name)).absolute() for name in config.records.split(",") if name
     ]
     if not is_own(root) and not originals:
-        _report(config, root, output, *_repair_other(root, output))
+        _repair_other(config, root, output)
         return
     flags = [f"--records={','.join(map(str, originals))}"] if originals else []
     command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
     index = RecordIndex.build(root, originals, command)
     dropped: list[DataError] = []
-    with suppress(_NothingKept), DatasetWriter(output, index.provenance) as writer:
+    with DatasetWriter(output, index.provenance) as writer:
         for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
             writer.add(episode)
         if not writer.num_episodes:
-            raise _NothingKept
-    _report(config, root, output, writer.num_episodes, writer.num_frames, dropped)
+            _report(config, root, output, writer, dropped)
+    _report(config, root, output, writer, dropped)
+
+
+def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
+    """Write the sound episodes of a dataset that egovcp did not collect."""
+    reader, dropped = LeRobotReader(root), list[DataError]()
+    with new_dataset(output) as folder:
+        writer = SubsetWriter(reader, folder)
+        for found in scan_episodes(reader):
+            if isinstance(found, DataError):
+                dropped.append(found)
+            else:
+                writer.add(found)
+        echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
+        if not writer.num_episodes:
+            _report(config, root, output, writer, dropped)
+        writer.finish()
+    _report(config, root, output, writer, dropped)
 
 
 def _report(
-    config: RepairConfig, root: Path, output: Path, kept: int, frames: int, dropped: list[DataError]
+    config: RepairConfig,
+    root: Path,
+    output: Path,
+    writer: DatasetWriter | SubsetWriter,
+    dropped: list[DataError],
 ) -> None:
+    """Print and write the result; raises `DataError` if no episode is kept."""
+    kept, frames = writer.num_episodes, writer.num_frames
     for error in dropped:
         echo(one_line(f"dropped: {error}"))
     problems = [problem_as_json(error, root) for error in dropped]
@@ -182,28 +204,6 @@ def _report(
     if not kept:
         raise DataError(f"no episode of {root} can be kept; {len(dropped)} problem(s), see above")
     echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
-
-
-def _repair_other(root: Path, output: Path) -> tuple[int, int, list[DataError]]:
-    """Write the sound episodes of a dataset that egovcp did not collect; returns the numbers of
-    episodes and frames, and what is left behind."""
-    reader, dropped = LeRobotReader(root), list[DataError]()
-    with suppress(_NothingKept), new_dataset(output) as folder:
-        writer = SubsetWriter(reader, folder)
-        for found in EpisodeScan(reader):
-            if isinstance(found, DataError):
-                dropped.append(found)
-            else:
-                writer.add(found)
-        if not writer.num_episodes:
-            raise _NothingKept
-        writer.finish()
-    echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
-    return writer.num_episodes, writer.num_frames, dropped
-
-
-class _NothingKept(Exception):
-    """No episode is sound."""
 
 
 def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) -> Iterator[Episode]:

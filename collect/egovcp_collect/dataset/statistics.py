@@ -6,11 +6,13 @@ An *event row* is one whose reward differs from the task's median reward by more
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from egovcp.data import DatasetReader, ReturnConfig
@@ -32,7 +34,7 @@ HISTOGRAM_BINS: Final = 40
 """Bins of an action's histogram, over [-1, 1]."""
 GRID_CELLS: Final = 8
 """Cells per axis of the grid over the x, y and z of one hand."""
-_NOT_DRAWN: Final = ("seed", "episode", "reward_terms", "contact_ticks")  # in the metadata
+_NOT_DRAWN: Final = {"seed", "episode", "reward_terms", "contact_ticks"}  # in the metadata
 _HANDS: Final = {"left": slice(0, 3), "right": slice(3, 6)}
 
 
@@ -100,6 +102,11 @@ class ActionStatistics:
             name: np.histogram(action[:, i], HISTOGRAM_BINS, (-1.0, 1.0))[0]
             for i, name in enumerate(ACTION_NAMES)
         }
+        grid = [(-1.0, 1.0)] * 3
+        cells = {
+            hand: np.histogramdd(action[:, axes], GRID_CELLS, grid)[0]
+            for hand, axes in _HANDS.items()
+        }
         metric = ACTION_BOX.to_metric(action)
         ranges = zip(metric.min(axis=0).tolist(), metric.max(axis=0).tolist(), strict=True)
         return cls(
@@ -108,15 +115,9 @@ class ActionStatistics:
                 name: float(np.minimum(count / count.sum(), 1.0 / len(count)).sum())
                 for name, count in counts.items()
             },
-            occupied={hand: _occupied(action[:, axes]) for hand, axes in _HANDS.items()},
+            occupied={hand: float((count > 0).mean()) for hand, count in cells.items()},
             workspace_m=dict(zip(ACTION_NAMES, ranges, strict=True)),
         )
-
-
-def _occupied(points: NDArray[np.floating]) -> float:
-    """Share of the cells of a grid over [-1, 1]^3 that hold at least one of (N, 3) points."""
-    counts, _ = np.histogramdd(points, GRID_CELLS, [(-1.0, 1.0)] * 3)
-    return float((counts > 0).mean())
 
 
 @dataclass(frozen=True)
@@ -244,19 +245,10 @@ def events_ahead(rows: TaskRows, steps: int) -> tuple[NDArray[np.bool_], NDArray
 
 def drawn_parameters(metadata: Sequence[Mapping[str, Any]]) -> dict[str, Distribution]:
     """Dotted name of each scene and randomisation parameter -> distribution over the episodes."""
-    values: dict[str, list[float]] = {}
-    for episode in metadata:
-        for name, value in _parameters(episode):
-            values.setdefault(name, []).append(value)
-    drawn = {name: Distribution.of(np.array(found)) for name, found in values.items()}
-    return {name: distribution for name, distribution in drawn.items() if distribution is not None}
-
-
-def _parameters(metadata: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    for name, value in metadata.items():
-        if name in _NOT_DRAWN:
-            continue
-        if isinstance(value, Mapping):
-            yield from _parameters(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float):
-            yield f"{prefix}{name}", float(value)
+    drawn = {}
+    for name, column in pd.json_normalize([dict(episode) for episode in metadata]).items():
+        numbers = [x for x in column if isinstance(x, int | float) and not math.isnan(x)]
+        distribution = Distribution.of(np.array(numbers))
+        if distribution is not None and not _NOT_DRAWN & {*str(name).split(".")}:
+            drawn[str(name)] = distribution
+    return drawn

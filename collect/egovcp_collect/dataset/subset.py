@@ -32,6 +32,10 @@ from egovcp.errors import DataError
 _SAMPLED_FRAMES: Final = 20  # for the statistics of a camera that are not recorded
 
 
+type Spans = dict[int, dict[str, VideoSpan]]
+"""Number of an episode -> its part of each video."""
+
+
 @dataclass(frozen=True)
 class SoundEpisode:
     """An episode without a problem."""
@@ -43,76 +47,69 @@ class SoundEpisode:
     """Its numbers and strings, (T, n) of each feature."""
 
 
-class EpisodeScan:
-    """Reads the episodes of a dataset, whose tables may be damaged, from its data files.
+def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
+    """Each sound episode once, in the order of the data files, and the problems of the others.
 
     What the tables lack is taken from the data: tasks from the episodes that name one task, and the
     place of an episode in the videos if these hold the frames of all episodes and no others.
     """
-
-    def __init__(self, reader: LeRobotReader) -> None:
-        self.reader = reader
-        self._check = LeRobotCheck(reader, every=True)
-        self._columns = [k for k, f in reader.features.items() if f.dtype != "video"]
-        self._spans = _rebuilt_spans(reader)
-        if not reader.tasks:
-            reader.tasks = self._named_tasks()
-
-    def __iter__(self) -> Iterator[SoundEpisode | DataError]:
-        """Each sound episode once, in order; the problems of the others."""
-        seen = set[int]()
-        for path in self.reader.data_files:
-            for part in self.reader.episodes(path, self._columns):
-                if isinstance(part, DataError):
-                    yield part
-                    seen |= {part.episode} if part.episode is not None else set()
-                    continue
-                number, table = part
-                if number in seen:
-                    problem = "an earlier episode has the same episode_index"
-                    yield DataError.at(path, problem, number)
-                    continue
-                seen.add(number)
-                yield from self._examine(path, number, table)
-        for row in self.reader.rows:
-            if row.index not in seen:
-                seen.add(row.index)
-                yield DataError.at(row.data, "its rows cannot be read", row.index)
-
-    def _examine(
-        self, path: Path, number: int, table: pa.Table
-    ) -> Iterator[SoundEpisode | DataError]:
-        row = self._check.by_number.get(number) or EpisodeRow(path, number, 0, 0, 0, path)
-        spans = self._spans.get(number, row.videos)
-        videos = self.reader.keys("video")
-        if missing := sorted(set(videos) - set(spans)):
-            problem = "meta/episodes does not list it, and the videos do not tell where it is"
-            yield DataError.at(path, f"{problem} in {missing[0]}", number)
-            return
-        row = replace(row, videos=spans)
-        self._check.by_number[number] = row
-        for found in self._check.episode_problems(path, number, table):
-            if isinstance(found, DataError):
-                yield found
-            else:
-                yield SoundEpisode(replace(row, data=path), table, found)
-
-    def _named_tasks(self) -> dict[int, str]:
-        """Task index -> task, from the episodes that name one."""
-        named = {row.index: row.tasks[0] for row in self.reader.rows if len(row.tasks) == 1}
-        tasks: dict[int, str] = {}
-        for path in self.reader.data_files:
-            for part in self.reader.episodes(path, ["task_index"]):
-                if not isinstance(part, DataError) and part[0] in named and len(part[1]):
-                    tasks.setdefault(part[1]["task_index"][0].as_py(), named[part[0]])
-        return tasks
+    check = LeRobotCheck(reader, every=True)
+    columns = [k for k, f in reader.features.items() if f.dtype != "video"]
+    spans = _rebuilt_spans(reader)
+    reader.tasks = reader.tasks or _named_tasks(reader)
+    seen = set[int]()
+    for path in reader.data_files:
+        for part in reader.episodes(path, columns):
+            if isinstance(part, DataError):
+                yield part
+                seen |= {part.episode} if part.episode is not None else set()
+                continue
+            number, table = part
+            if number in seen:
+                problem = "an earlier episode has the same episode_index"
+                yield DataError.at(path, problem, number)
+                continue
+            seen.add(number)
+            yield from _examine(check, spans, path, number, table)
+    for row in reader.rows:
+        if row.index not in seen:
+            seen.add(row.index)
+            yield DataError.at(row.data, "its rows cannot be read", row.index)
 
 
-def _rebuilt_spans(reader: LeRobotReader) -> dict[int, dict[str, VideoSpan]]:
+def _examine(
+    check: LeRobotCheck, spans: Spans, path: Path, number: int, table: pa.Table
+) -> Iterator[SoundEpisode | DataError]:
+    row = check.by_number.get(number) or EpisodeRow(path, number, 0, 0, 0, path)
+    row = replace(row, videos=spans.get(number, row.videos))
+    if missing := sorted(set(check.reader.keys("video")) - set(row.videos)):
+        problem = "meta/episodes does not list it, and the videos do not tell where it is"
+        yield DataError.at(path, f"{problem} in {missing[0]}", number)
+        return
+    check.by_number[number] = row
+    for found in check.episode_problems(path, number, table):
+        if isinstance(found, DataError):
+            yield found
+        else:
+            yield SoundEpisode(replace(row, data=path), table, found)
+
+
+def _named_tasks(reader: LeRobotReader) -> dict[int, str]:
+    """Task index -> task, from the episodes that name one."""
+    named = {row.index: row.tasks[0] for row in reader.rows if len(row.tasks) == 1}
+    tasks: dict[int, str] = {}
+    for path in reader.data_files:
+        for part in reader.episodes(path, ["task_index"]):
+            if not isinstance(part, DataError) and part[0] in named and len(part[1]):
+                tasks.setdefault(part[1]["task_index"][0].as_py(), named[part[0]])
+    return tasks
+
+
+def _rebuilt_spans(reader: LeRobotReader) -> Spans:
     """Episode -> where each video shows it, if the video files, in order, hold all episodes one
     after another; of other cameras nothing."""
     lengths: dict[int, int] = {}
-    spans: dict[int, dict[str, VideoSpan]] = {}
+    spans: Spans = {}
     videos = reader.keys("video")
     for path in reader.data_files if videos else ():
         for part in reader.episodes(path, ["episode_index"]):
@@ -315,7 +312,7 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
     wanted = set(episodes)
     with new_dataset(root) as folder:
         writer = SubsetWriter(reader, folder)
-        for found in EpisodeScan(reader):
+        for found in scan_episodes(reader):
             if isinstance(found, DataError):
                 if found.episode is None or found.episode in wanted:
                     raise DataError(f"{found}; `egovcp-dataset repair` keeps what is sound")

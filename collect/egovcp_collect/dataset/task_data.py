@@ -57,42 +57,35 @@ def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
     """
     columns = reader.read_columns(_COLUMNS)
     tasks = np.array([reader.task(i) for i in range(len(reader))])
-    return [
-        _rows_of(reader, task, tasks == task, columns, returns)
-        for task in dict.fromkeys(tasks.tolist())
-    ]
-
-
-def _rows_of(
-    reader: DatasetReader,
-    task: str,
-    of_task: NDArray[np.bool_],
-    columns: Mapping[str, NDArray[Any]],
-    returns: ReturnConfig,
-) -> TaskRows:
-    episodes = np.flatnonzero(of_task)
-    length = reader.lengths[episodes]
-    rows = np.repeat(of_task, reader.lengths)
-    last = length.cumsum() - 1
-    reward = columns[spec.REWARD_KEY][rows]
-    done, truncated = columns[spec.DONE_KEY][rows], columns[spec.TRUNCATED_KEY][rows]
-    rewards = np.split(reward, last[:-1] + 1)
-    valid = [
-        mc_valid(n, reader.time_limit(i), returns.steps, returns.keep_truncated)
-        for i, n in zip(episodes.tolist(), length.tolist(), strict=True)
-    ]
-    return TaskRows(
-        task=task,
-        episodes=episodes,
-        length=length,
-        metadata=[reader.metadata(i) for i in episodes.tolist()],
-        action=columns[spec.ACTION_KEY][rows],
-        reward=reward,
-        fallen=is_terminal(done, truncated)[last],
-        success=columns[spec.SUCCESS_KEY][rows][last],
-        mc_return=np.concatenate([mc_return(r, returns.gamma, returns.steps) for r in rewards]),
-        mc_valid=np.concatenate(valid),
-    )
+    found = []
+    for task in dict.fromkeys(tasks.tolist()):
+        episodes = np.flatnonzero(tasks == task)
+        length = reader.lengths[episodes]
+        last = length.cumsum() - 1
+        rows = np.repeat(tasks == task, reader.lengths)
+        action, reward, done, success, truncated = (columns[key][rows] for key in _COLUMNS)
+        rewards = np.split(reward, last[:-1] + 1)
+        valid = [
+            mc_valid(n, reader.time_limit(i), returns.steps, returns.keep_truncated)
+            for i, n in zip(episodes.tolist(), length.tolist(), strict=True)
+        ]
+        found.append(
+            TaskRows(
+                task=task,
+                episodes=episodes,
+                length=length,
+                metadata=[reader.metadata(i) for i in episodes.tolist()],
+                action=action,
+                reward=reward,
+                fallen=is_terminal(done, truncated)[last],
+                success=success[last],
+                mc_return=np.concatenate(
+                    [mc_return(r, returns.gamma, returns.steps) for r in rewards]
+                ),
+                mc_valid=np.concatenate(valid),
+            )
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -164,6 +157,6 @@ def _event_frames(episode: Episode, index: int) -> DepthFrames:
     """Up to `SHOWN_FRAMES` images from the event on; from the start if there is none."""
     first = min(episode.metadata.get("event_tick") or 0, len(episode) - 1)
     known = {entry.name: entry.task for entry in task_entries()}.get(episode.task)
-    last = min(first + (known or Task).event_ticks, len(episode) - 1)
+    last = min(first + (known or Task).event_duration_ticks, len(episode) - 1)
     tick = np.unique(np.rint(np.linspace(first, last, SHOWN_FRAMES)).astype(np.int64))
     return DepthFrames(index, tick, episode.depth[tick])

@@ -44,10 +44,13 @@ def run_viz(config: VizConfig) -> None:
     """Write the recording."""
     require_packages("egovcp-collect", "the recording", "mcap", "rerun")
     source = locate(config.dataset)
-    only_own = config.output.endswith(".mcap")
-    own = DatasetReader.open(config.dataset) if only_own or is_own(source.root) else None
-    other = LeRobotReader.open(source.root) if own is None else None
-    count = len(own) if own is not None else len(other.rows) if other is not None else 0
+    reader: DatasetReader | LeRobotReader
+    if is_own(source.root) or config.output.endswith(".mcap"):
+        reader = DatasetReader.open(config.dataset)
+        count = len(reader)
+    else:
+        reader = LeRobotReader.open(source.root)
+        count = len(reader.rows)
     if not 0 <= config.episode < count:
         raise UsageError(f"--episode={config.episode}: {source.root} has episodes 0 to {count - 1}")
     name = source.root.name
@@ -55,13 +58,13 @@ def run_viz(config: VizConfig) -> None:
         name = source.repo_id.partition("/")[2]
     output = Path(os.path.expanduser(config.output or f"{name}-episode-{config.episode}.rrd"))
     require_writable(output.parent)
-    if own is not None:
-        write_recording(own, config.episode, output)
+    if isinstance(reader, DatasetReader):
+        write_recording(reader, config.episode, output)
         echo(f"wrote {output}; {POSE}")
-    elif other is not None:
+    else:
         from egovcp_collect.dataset.feature_recording import record_features
 
-        shown = record_features(other, other.rows[config.episode], output)
+        shown = record_features(reader, reader.rows[config.episode], output)
         echo(f"wrote {output}: {', '.join(shown)}; not shown: the robot, whose model is not known")
     if config.spawn:  # the viewer outlives this command; it accepts local connections only
         command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(output)]

@@ -1,15 +1,13 @@
-"""The experiments, one module each, with
-
-SUMMARY                   the line in ``egovcp-experiment --help``
-cells(config)             all cells, each after those it needs
-report(config, records)   the `ExperimentReport` of the available results
-"""
+"""The experiments, one module each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
 
+from egovcp_experiment.cell import Cell
+from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiments import (
     ablations,
     generalise,
@@ -21,15 +19,67 @@ from egovcp_experiment.experiments import (
     table1,
     variance,
 )
+from egovcp_experiment.grid import Grid
+from egovcp_experiment.report import ExperimentReport
+from egovcp_experiment.results import Records
 
-EXPERIMENTS: Final[Mapping[str, Any]] = {
-    "ablations": ablations,
-    "generalise": generalise,
-    "interpret": interpret,
-    "multitask": multitask,
-    "planners": planners,
-    "ppo": ppo,
-    "sample-efficiency": sample_efficiency,
-    "table1": table1,
-    "variance": variance,
+
+@dataclass(frozen=True)
+class Experiment:
+    """One of the paper's experiments."""
+
+    summary: str
+    """The line in ``egovcp-experiment --help``."""
+    make: Callable[[Grid, Records], ExperimentReport]
+    """Requests all cells from the grid, and reports those that have results."""
+
+    def cells(self, config: ExperimentConfig) -> list[Cell]:
+        """All cells, each after those it needs: what a report without results requests.
+
+        Raises:
+            UsageError: an option is invalid for this experiment.
+        """
+        grid = Grid(config)
+        self.make(grid, {})
+        return grid.cells
+
+    def report(self, config: ExperimentConfig, records: Records) -> ExperimentReport:
+        """The report of the available results."""
+        return self.make(Grid(config), records)
+
+
+EXPERIMENTS: Final[Mapping[str, Experiment]] = {
+    "ablations": Experiment(
+        "what each choice of the world model is worth on held-out episodes", ablations.report
+    ),
+    "generalise": Experiment(
+        "unseen boxes, sizes, speeds, walls and arches; noise, delay and physics; several tasks in "
+        "one episode (fig. 4a)",
+        generalise.report,
+    ),
+    "interpret": Experiment(
+        "value maps of a hand, open-loop images, and behaviour with and without events (fig. 7)",
+        interpret.report,
+    ),
+    "multitask": Experiment(
+        "one model on mixed data against one per task; t-SNE of h and z (fig. 6)", multitask.report
+    ),
+    "planners": Experiment(
+        "CEM, iCEM, MPPI and random shooting in equal time; termination rules", planners.report
+    ),
+    "ppo": Experiment(
+        "PPO, the model-free baseline, along its training, next to the planner", ppo.report
+    ),
+    "sample-efficiency": Experiment(
+        "success against the transitions that a model has seen (fig. 5)", sample_efficiency.report
+    ),
+    "table1": Experiment(
+        "horizons, ARWM, Rew-MPC and TD-MPC next to ours; tests of the paper's ordering (table I)",
+        table1.report,
+    ),
+    "variance": Experiment(
+        "do the errors of Q along a plan average out, and predict the best horizon "
+        "(section III-D)?",
+        variance.report,
+    ),
 }

@@ -9,12 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell, Flags
-from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, Grid, Model
+from egovcp_experiment.cell import Flags
+from egovcp_experiment.grid import ALL, Grid
 from egovcp_experiment.report import ExperimentReport, Table
-
-SUMMARY: Final = "what each choice of the world model is worth on held-out episodes"
 
 #: Ablations that are presets of egovcp-train.
 _PRESETS: Final = (
@@ -35,51 +32,38 @@ CHOICES: Final[dict[str, Flags]] = {
 }
 
 
-def _trainings(grid: Grid) -> dict[str, list[str]]:
-    """Choice -> names of its cells, one per seed."""
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    task = ALL if len(config.tasks) > 1 else config.tasks[0]
-    equal = {"steps": config.train.compared_steps, "max_minutes": 0}
-    return {
+    trained_on = ALL if len(config.tasks) > 1 else config.tasks[0]
+    trainings = {
         name: [
             grid.train(
-                task, seed, Model(name, {**equal, **flags}), f"ablate-{task}-{name}-s{seed}"
+                trained_on, seed, grid.compared(name, flags), f"ablate-{trained_on}-{name}-s{seed}"
             ).name
             for seed in config.train.seeds
         ]
         for name, flags in config.chosen(CHOICES).items()
     }
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
-    _trainings(grid)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    trainings = _trainings(Grid(config)).items()
-    figures = {
-        task: {
-            name: row
-            for name, trained in trainings
-            if (row := results.heldout(records, trained, task))
-        }
-        for task in config.tasks
-    }
-    return ExperimentReport(
+    report = ExperimentReport(
         "Ablations: what each choice of the world model is worth on held-out episodes",
-        tuple(line for task, rows in figures.items() for line in _conclusions(task, rows)),
-        (
+        parts=[
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
             "(x): times below the error of repeating the last image, at that many ticks "
             "open-loop. `paper` is judged against its own returns, which differ from those of the "
-            "others.",
-            *(_table(task, rows) for task, rows in figures.items()),
-        ),
-        figures,
+            "others."
+        ],
     )
+    for task in config.tasks:
+        rows = {
+            name: row
+            for name, cells in trainings.items()
+            if (row := results.heldout(records, cells, task))
+        }
+        report.shows += _conclusions(task, rows)
+        report.parts.append(_table(task, rows))
+        report.figures[task] = rows
+    return report
 
 
 def _conclusions(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:
@@ -105,8 +89,8 @@ def _table(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> Tabl
     return Table(
         f"{task} ({results.OVER_SEEDS})",
         ("choice", "changed", *results.HELDOUT),
-        tuple(
+        [
             (name, changed(name), *map(results.over_seeds, row.values()))
             for name, row in rows.items()
-        ),
+        ],
     )

@@ -4,30 +4,26 @@ delay, feet, payload and gains, and several tasks in one episode (figure 4a)."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from egovcp.eval_scores import EvalScores
 from egovcp.sim.tasks.sequence import SequenceTask
 from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell, Flags
+from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, MIXED, Grid, Variant
-from egovcp_experiment.report import ExperimentReport, Part, Table, percent
+from egovcp_experiment.grid import ALL, MIXED, Grid
+from egovcp_experiment.report import ExperimentReport, Table, percent
 
-SUMMARY: Final = (
-    "unseen boxes, sizes, speeds, walls and arches; noise, delay and physics; several tasks in one "
-    "episode (fig. 4a)"
-)
 #: The first condition of a task, which the others are compared with.
 TRAINED: Final = "as_trained"
 _REFERENCES: Final = ("hold", "oracle")
 
 #: Conditions of every task. Training has noise of 0.001 to 0.004 z^2, up to 1 % holes, actions
-#: delayed by 0 to 2 ticks of 20 ms, images 20 to 80 ms old, and a camera that looks up by 10 to 15
-#: degrees.
-_SENSING: Final[dict[str, Flags]] = {
+#: delayed by 0 to 2 ticks of 20 ms, images 20 to 80 ms old, a camera that looks up by 10 to 15
+#: degrees, feet of four points each, a payload of -0.5 to 1.5 kg, and gains within 5 % (stiffness)
+#: and 10 % (damping).
+_EVERY_TASK: Final[dict[str, Flags]] = {
     "noise_x4": {"env.camera.noise_per_z2": [0.008, 0.016]},
     "holes_10": {"env.camera.hole_probability": [0.1, 0.1]},
     "no_noise": {
@@ -40,10 +36,6 @@ _SENSING: Final[dict[str, Flags]] = {
     "delay_image_120ms": {"env.delay.image_age": [0.12, 0.12]},
     "pitch_20_up": {"env.camera.pitch_range": [-0.349, -0.349]},
     "pitch_5_up": {"env.camera.pitch_range": [-0.087, -0.087]},
-}
-#: Physics for every task. Training has feet of four points each, a payload of -0.5 to 1.5 kg, and
-#: gains within 5 % (stiffness) and 10 % (damping).
-_PHYSICS: Final[dict[str, Flags]] = {
     "stock_feet": {"env.feet": "stock"},
     "payload_3kg": {"env.randomise.payload": [3, 3]},
     "gains_80": {
@@ -89,12 +81,8 @@ _SEQUENCES: Final[dict[str, Flags]] = {
 }
 
 
-@dataclass(frozen=True)
-class _Condition:
-    """Scores in one condition."""
-
-    planner: EvalScores
-    references: dict[str, EvalScores]
+type Scores = dict[str, EvalScores]
+"""Condition or controller -> scores."""
 
 
 def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
@@ -110,7 +98,7 @@ def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
     if task == "wall":
         low, high = WallConfig().push_speed_range
         own["harder"] = {"env.wall.push_speed_range": [high, high + (high - low) / 2]}
-    return {**own, **_SENSING, **_PHYSICS}
+    return {**own, **_EVERY_TASK}
 
 
 def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
@@ -126,89 +114,75 @@ def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
     }
 
 
-def _plays(grid: Grid) -> dict[str, dict[str, tuple[list[str], str]]]:
-    """Task -> condition -> names of the planner's cells, one per seed, and of the references'."""
-    return {
-        task: {
-            name: (
-                grid.plays(task, Variant(f"in_{name}" if flags else MIXED, play=flags), ALL),
-                grid.references(task, f"references-{task}-{name}", flags, _REFERENCES).name,
-            )
-            for name, flags in row.items()
-        }
-        for task, row in _chosen(grid.config).items()
-    }
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
-    _plays(grid)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    plays = _plays(Grid(config))
-    shows: list[str] = []
-    parts: list[Part] = [
-        "The model knows scenes `as_trained` only. All conditions draw the same scenarios, so that "
-        "differences are paired. `hold` and `oracle` (scripted, with the simulator's state and the "
-        "same delays) show how hard a condition is: where the oracle fails, too, it may be "
-        "infeasible."
-    ]
-    if SequenceTask.name in plays:
-        parts.append(
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
+    chosen = _chosen(grid.config)
+    report = ExperimentReport(
+        "Generalisation: scenes that no model was trained on",
+        parts=[
+            "The model knows scenes `as_trained` only. All conditions draw the same scenarios, so "
+            "that differences are paired. `hold` and `oracle` (scripted, with the simulator's "
+            "state and the same delays) show how hard a condition is: where the oracle fails, too, "
+            "it may be infeasible."
+        ],
+    )
+    if SequenceTask.name in chosen:
+        report.parts.append(
             "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
             "played by the same model, whose input names neither tasks nor times. Each part draws "
             "what its task draws alone; parts after a fall are failures."
         )
-    figures: dict[str, Any] = {}
-    for task, row in plays.items():
-        found = {}
-        for name, (played, references) in row.items():
-            planner = results.eval_scores(records, played, task)
-            if planner is not None:
-                known = results.controller_scores(records, references, task, _REFERENCES)
-                found[name] = _Condition(planner, known)
+    for task, row in chosen.items():
+        planner: Scores = {}
+        references: dict[str, Scores] = {}
+        for name, flags in row.items():
+            variant = f"in_{name}" if flags else MIXED
+            plays = grid.plays(task, variant, flags, trained_on=ALL)
+            scores = results.eval_scores(records, plays, task)
+            cell = grid.references(task, f"references-{task}-{name}", flags, _REFERENCES)
+            if scores is not None:
+                planner[name] = scores
+                references[name] = results.controller_scores(records, cell, task, _REFERENCES)
         base = next(iter(row))
-        if base in found:
-            planner_scores = {name: each.planner for name, each in found.items()}
-            parts.append(_table(task, found, _chosen(config)[task]))
-            parts.append(results.comparison_plot(f"conditions-{task}", task, planner_scores, base))
-            shows += _conclusions(task, found)
-        figures[task] = {
-            name: results.figures_of({"planner": each.planner, **each.references})
-            for name, each in found.items()
+        if base in planner:
+            report.parts.append(_table(task, planner, references, row))
+            plot = results.comparison_plot(f"conditions-{task}", task, planner, base)
+            report.parts.append(plot)
+            report.shows += _conclusions(task, planner)
+        report.figures[task] = {
+            name: results.figures_of({"planner": scores, **references[name]})
+            for name, scores in planner.items()
         }
-    title = "Generalisation: scenes that no model was trained on"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
+    return report
 
 
-def _table(task: str, found: Mapping[str, _Condition], flags: Mapping[str, Flags]) -> Table:
-    planner = {name: each.planner for name, each in found.items()}
-    kinds = list(dict.fromkeys(part for each in planner.values() for part in each.parts))
-    columns = []
-    for name, each in found.items():
-        rates = each.planner.part_rates
-        rates |= {r: scores.success_rate for r, scores in each.references.items()}
-        scene = " ".join(f"`{k}={v}`" for k, v in flags[name].items())
-        columns.append((*(percent(rates.get(r)) for r in (*kinds, *_REFERENCES)), scene))
+def _table(
+    task: str, planner: Scores, references: Mapping[str, Scores], flags: Mapping[str, Flags]
+) -> Table:
+    """The comparison with the first condition, rates of parts and references, and the scenes."""
+    table = results.comparison(task, planner, next(iter(flags)))
+    kinds = list(dict.fromkeys(part for scores in planner.values() for part in scores.parts))
     head = (*(f"planner's {kind}" for kind in kinds), *_REFERENCES, "scene")
-    return results.comparison(task, planner, next(iter(flags))).with_columns(head, columns)
+    rows = []
+    for line, (name, scores) in zip(table.rows, planner.items(), strict=True):
+        rates = scores.part_rates | {r: s.success_rate for r, s in references[name].items()}
+        scene = " ".join(f"`{k}={v}`" for k, v in flags[name].items())
+        rows.append((*line, *(percent(rates.get(r)) for r in (*kinds, *_REFERENCES)), scene))
+    return Table(task, (*table.head, *head), rows)
 
 
-def _conclusions(task: str, found: Mapping[str, _Condition]) -> list[str]:
-    (base, first), *others = found.items()
+def _conclusions(task: str, planner: Scores) -> list[str]:
+    (base, first), *others = planner.items()
     worse, same = [], []
-    for name, each in others:
-        gain = each.planner.gain(first.planner)
+    for name, scores in others:
+        gain = scores.gain(first)
         if gain.success_interval[1] < 0:
             worse.append(f"`{name}` {100 * gain.success:+.0f}")
         else:
             same.append(f"`{name}`")
     scenes = "scenes as trained" if base == TRAINED else f"episodes of `{base}`"
-    lines = [f"{task}: {percent(first.planner.success_rate)} of {scenes}"]
-    for name, each in found.items():
-        rates = ", ".join(f"{kind} {percent(r)}" for kind, r in each.planner.part_rates.items())
+    lines = [f"{task}: {percent(first.success_rate)} of {scenes}"]
+    for name, scores in planner.items():
+        rates = ", ".join(f"{kind} {percent(r)}" for kind, r in scores.part_rates.items())
         if rates:
             lines.append(f"{task}: parts won in `{name}`: {rates}")
     if worse:

@@ -8,12 +8,9 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell
-from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.grid import Grid
 from egovcp_experiment.report import (
     ExperimentReport,
-    Part,
     Plot,
     Table,
     draw,
@@ -23,78 +20,52 @@ from egovcp_experiment.report import (
 )
 from egovcp_experiment.studies.open_loop import HORIZONS
 
-SUMMARY: Final = (
-    "value maps of a hand, open-loop images, and behaviour with and without events (fig. 7)"
-)
-#: Study -> its tasks; empty: all.
-STUDIES: Final[dict[str, tuple[str, ...]]] = {
-    "value_maps": ("ball",),
-    "open_loop": (),
-    "behaviour": (),
-}
 
-type _Section = tuple[list[str], list[Part]]
-"""Conclusions and parts."""
-
-
-def _studies(grid: Grid) -> dict[tuple[str, str], str]:
-    """(study, task) -> name of its cell; of the first training seed."""
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    found = {}
-    for name, tasks in config.chosen(STUDIES).items():
-        for task in (task for task in config.tasks if not tasks or task in tasks):
+    report = ExperimentReport(
+        "Interpretation: values, open-loop predictions, and behaviour with and without events"
+    )
+    studies = {
+        "value_maps": _add_value_maps,
+        "open_loop": _add_open_loop,
+        "behaviour": _add_behaviour,
+    }
+    for name, add in config.chosen(studies).items():
+        tasks = [task for task in config.tasks if task == "ball" or name != "value_maps"]
+        for task in tasks:
             flags = {"task": task, "episodes": config.play.episodes}
-            found[name, task] = grid.sim_study(name, task, flags)
-    return found
+            cell = grid.sim_study(name, task, flags)
+            if cell in records:
+                found = records[cell]["figures"]
+                drawn_only = ("maps", "strips", "x", "z")
+                report.figures[cell] = {k: v for k, v in found.items() if k not in drawn_only}
+                add(report, task, found)
+    return report
 
 
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
-    _studies(grid)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    sections = {"value_maps": _value_maps, "open_loop": _open_loop, "behaviour": _behaviour}
-    shows: list[str] = []
-    parts: list[Part] = []
-    figures: dict[str, Any] = {}
-    for (name, task), cell in _studies(Grid(config)).items():
-        if cell in records:
-            found = records[cell]["figures"]
-            drawn_only = ("maps", "strips", "x", "z")
-            figures[f"{name}-{task}"] = {k: v for k, v in found.items() if k not in drawn_only}
-            lines, more = sections[name](task, found)
-            shows += lines
-            parts += more
-    title = "Interpretation: values, open-loop predictions, and behaviour with and without events"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
-
-
-def _value_maps(task: str, found: Mapping[str, Any]) -> _Section:
+def _add_value_maps(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     summary = found["summary"]
-    rows = tuple(
+    rows = [
         (name, str(row["episodes"]), f"{row['spread']:.3f}", f"{100 * row['height_error_m']:.1f}")
         for name, row in summary.items()
-    )
+    ]
     head = ("flight", "episodes", "best - worst (deviations of the return)", "height error (cm)")
-    parts: list[Part] = [
+    report.parts += [
         "Q of the planned action with the target of that hand moved over its x-z plane, all else "
         "equal. Height error: between the best point of the map and the height of the ball's aim.",
         Table("Value map of the hand on the ball's side, means over episodes", head, rows),
     ]
     if found["maps"]:
-        parts.append(_map_plot(found))
-    if not {"before", "75%"} <= summary.keys():
-        return [], parts
-    before, late = summary["before"], summary["75%"]
-    line = (
-        f"{task}: the value map of a hand spans {before['spread']:.2f} deviations "
-        f"of the return before the throw and {late['spread']:.2f} at 75 % of the flight; the "
-        f"best point is {100 * before['height_error_m']:.0f} and "
-        f"{100 * late['height_error_m']:.0f} cm off the ball's height"
-    )
-    return [line], parts
+        report.parts.append(_map_plot(found))
+    if {"before", "75%"} <= summary.keys():
+        before, late = summary["before"], summary["75%"]
+        report.shows.append(
+            f"{task}: the value map of a hand spans {before['spread']:.2f} deviations "
+            f"of the return before the throw and {late['spread']:.2f} at 75 % of the flight; the "
+            f"best point is {100 * before['height_error_m']:.0f} and "
+            f"{100 * late['height_error_m']:.0f} cm off the ball's height"
+        )
 
 
 def _map_plot(found: Mapping[str, Any]) -> Plot:
@@ -129,7 +100,7 @@ def _map_plot(found: Mapping[str, Any]) -> Plot:
     )
 
 
-def _open_loop(task: str, found: Mapping[str, Any]) -> _Section:
+def _add_open_loop(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     errors = found["errors_m"]
     last = errors[str(HORIZONS[-1])]
     head = ("ticks ahead", "model (cm)", "repeat (cm)", "moving: model (cm)", "moving: repeat (cm)")
@@ -137,22 +108,20 @@ def _open_loop(task: str, found: Mapping[str, Any]) -> _Section:
         f"{task}: open-loop depth under the actions that were sent, {found['episodes']} episodes"
     )
     columns = ("model", "repeat", "model_moving", "repeat_moving")
-    rows = tuple((k, *(_centimetres(row[c]) for c in columns)) for k, row in errors.items())
-    parts: list[Part] = [Table(title, head, rows)]
-    lines = []
+    rows = [(k, *(_centimetres(row[c]) for c in columns)) for k, row in errors.items()]
+    report.parts.append(Table(title, head, rows))
     if last["model_moving"] is not None:
-        lines.append(
+        report.shows.append(
             f"{task}: {HORIZONS[-1]} ticks ahead, the error on moving pixels is "
             f"{100 * last['model_moving']:.0f} cm, that of repeating the last image "
             f"{100 * last['repeat_moving']:.0f} cm"
         )
     if found["strips"]:
-        parts.append(_strip_plot(task, found["strips"]))
-    return lines, parts
+        report.parts.append(_strip_plot(task, found["strips"]))
 
 
-def _centimetres(metres: float | None, form: str = ".1f") -> str:
-    return number(None if metres is None else 100 * metres, form)
+def _centimetres(metres: float | None) -> str:
+    return number(None if metres is None else 100 * metres, ".1f")
 
 
 def _strip_plot(task: str, strips: Sequence[Mapping[str, Any]]) -> Plot:
@@ -186,7 +155,7 @@ _BEHAVIOUR: Final = {
 }
 
 
-def _behaviour(task: str, found: Mapping[str, Any]) -> _Section:
+def _add_behaviour(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     rows = []
     for key, name in _BEHAVIOUR.items():
         if key in found:
@@ -199,8 +168,8 @@ def _behaviour(task: str, found: Mapping[str, Any]) -> _Section:
                 low, high = row["ci95"]
                 shown = (f"{100 * row['mean']:.1f}", f"{100 * low:.1f} to {100 * high:.1f}")
             rows.append((name, *shown, str(row["episodes"])))
-    table = Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), tuple(rows))
-    return _behaviour_conclusion(task, found), [table]
+    report.parts.append(Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), rows))
+    report.shows += _behaviour_conclusion(task, found)
 
 
 def _behaviour_conclusion(task: str, found: Mapping[str, Any]) -> list[str]:

@@ -9,71 +9,50 @@ import numpy as np
 
 from egovcp.eval_scores import EvalScores, points_range
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, MIXED, REFERENCES, Grid, Variant
-from egovcp_experiment.report import (
-    ExperimentReport,
-    Part,
-    Plot,
-    draw,
-    number,
-)
+from egovcp_experiment.grid import ALL, MIXED, REFERENCES, Grid
+from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
 
-SUMMARY: Final = "one model on mixed data against one per task; t-SNE of h and z (fig. 6)"
 _LATENT_EPISODES: Final = 16  # per task
 
 
-def _plays(grid: Grid, task: str) -> dict[str, list[str]]:
-    """``single`` and ``mixed`` -> names of their cells, one per seed."""
-    return {
-        "single": grid.plays(task, Variant("single")),
-        "mixed": grid.plays(task, Variant(MIXED), ALL),
-    }
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
-    for task in config.tasks:
-        _plays(grid, task)
-    for task in config.tasks:
-        grid.references(task)
-    episodes = min(config.play.episodes, _LATENT_EPISODES)
-    grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    grid = Grid(config)
-    shows: list[str] = []
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
+    config = grid.config
+    report = ExperimentReport(
+        "Multi-task: one model on mixed data against one for each task",
+        parts=[_introduction(config)],
+    )
     tables: list[Part] = []
-    figures: dict[str, Any] = {}
     levels: dict[str, dict[str, float]] = {}
     for task in config.tasks:
-        scores = results.all_scores(records, _plays(grid, task), task)
-        references = results.controller_scores(records, f"references-{task}", task, REFERENCES)
-        figures[task] = results.figures_of({**scores, **references})
+        plays = {
+            "single": grid.plays(task),
+            "mixed": grid.plays(task, MIXED, trained_on=ALL),
+        }
+        scores = results.all_scores(records, plays, task)
+        cell = grid.references(task)
+        references = results.controller_scores(records, cell, task, REFERENCES)
+        report.figures[task] = results.figures_of({**scores, **references})
         if scores:
             tables.append(results.comparison(task, {**scores, **references}, "single"))
         if len(scores) == 2:
-            shows.append(_conclusion(task, scores))
+            report.shows.append(_conclusion(task, scores))
         if {"oracle", "random"} <= references.keys():
             levels[task] = {name: _level(each, references) for name, each in scores.items()}
-            figures[task]["normalised"] = levels[task]
-    parts: list[Part] = [
-        _introduction(config),
-        *([_levels_plot(levels)] if levels else []),
-        *tables,
-    ]
-    if "latents" in records:
-        latents = records["latents"]["figures"]
-        parts.append(_maps(latents))
-        shows.append(_separation(latents))
-        figures["latents"] = {
+            report.figures[task]["normalised"] = levels[task]
+    if levels:
+        report.parts.append(_levels_plot(levels))
+    report.parts += tables
+    episodes = min(config.play.episodes, _LATENT_EPISODES)
+    cell = grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
+    if cell in records:
+        latents = records[cell]["figures"]
+        report.parts.append(_maps(latents))
+        report.shows.append(_separation(latents))
+        report.figures["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }
-    title = "Multi-task: one model on mixed data against one for each task"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
+    return report
 
 
 def _introduction(config: ExperimentConfig) -> str:

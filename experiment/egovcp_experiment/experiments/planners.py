@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell, CellFigure, Flags
-from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import Grid, Variant
-from egovcp_experiment.report import ExperimentReport, Part, Table
+from egovcp_experiment.cell import CellFigure, Flags
+from egovcp_experiment.grid import Grid
+from egovcp_experiment.report import ExperimentReport, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
 
-SUMMARY: Final = "CEM, iCEM, MPPI and random shooting in equal time; termination rules"
 #: Rule -> flags of egovcp-eval; the search is the policy's own. ``default`` has
 #: termination_rule=shift and action_parameterization=target, unless it was trained with others.
 RULES: Final[dict[str, Flags]] = {
@@ -25,74 +23,64 @@ RULES: Final[dict[str, Flags]] = {
 }
 
 
-def _timing(grid: Grid, task: str) -> str:
-    """Cell that times the searches, for all seeds: times depend on the networks' sizes alone."""
-    budget = {"budget_ms": grid.config.play.budget_ms}
-    return grid.study("plan_time", task, budget, exclusive=True)
-
-
-def _plays(grid: Grid, task: str) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    """Search -> names of its cells, one per seed, and rule -> names of its cells."""
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
+    report = ExperimentReport(
+        "Planners: searches in equal time, and rules after a failure",
+        parts=[
+            "Searches: each has the largest number of candidates with a plan time below "
+            f"{config.play.budget_ms:g} ms on the machine below; all searches were timed in turns. "
+            "The number of elites is the planner's, at most half of the candidates. "
+            "`cem_1` and `cem_6` are `cem` with 1 and 6 iterations instead of 3. "
+            "Rules: the policy's own search."
+        ],
+    )
     chosen = config.chosen({**dict.fromkeys(SEARCHES), **dict.fromkeys(RULES)})
-    for seed in config.train.seeds:
-        grid.model(task, seed)
-    searches = {}
-    for name in (name for name in SEARCHES if name in chosen):
-        options = ("optimiser", "iterations", "samples", "elites")
-        timing = _timing(grid, task)
-        flags = {f"planner.{o}": CellFigure(timing, ("searches", name, o)) for o in options}
-        searches[name] = grid.plays(task, Variant(f"search_{name}", play=flags))
-    rules = {
-        name: grid.plays(task, Variant(name, play=flags))
-        for name, flags in RULES.items()
-        if name in chosen
-    }
-    return searches, rules
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
     for task in config.tasks:
-        _plays(grid, task)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    grid = Grid(config)
-    shows: list[str] = []
-    parts: list[Part] = [
-        f"Searches: each has the largest number of candidates with a plan time below "
-        f"{config.play.budget_ms:g} ms on the machine below; all searches were timed in turns. "
-        "The number of elites is the planner's, at most half of the candidates. "
-        "`cem_1` and `cem_6` are `cem` with 1 and 6 iterations instead of 3. "
-        "Rules: the policy's own search."
-    ]
-    figures: dict[str, Any] = {}
-    for task in config.tasks:
-        searches, rules = (results.all_scores(records, plays, task) for plays in _plays(grid, task))
+        search_plays = _search_plays(grid, task, [name for name in SEARCHES if name in chosen])
+        rule_plays = {
+            name: grid.plays(task, name, flags) for name, flags in RULES.items() if name in chosen
+        }
+        searches = results.all_scores(records, search_plays, task)
+        rules = results.all_scores(records, rule_plays, task)
         timing = records.get(f"plan_time-{task}")
         if timing is not None:
-            parts.append(_timings(task, timing["figures"]["searches"], searches))
+            report.parts.append(_timings(task, timing["figures"]["searches"], searches))
         for kind, scores, reference in (("searches", searches, "cem"), ("rules", rules, "default")):
             if scores:
                 title = f"{task}: {kind}"
-                parts.append(results.comparison(title, scores, reference))
-                parts.append(results.comparison_plot(f"{task}-{kind}", title, scores, reference))
-                shows += _conclusions(task, kind, scores, reference)
+                report.parts += [
+                    results.comparison(title, scores, reference),
+                    results.comparison_plot(f"{task}-{kind}", title, scores, reference),
+                ]
+                report.shows += _conclusions(task, kind, scores, reference)
         named = {f"search_{name}": each for name, each in searches.items()}
-        figures[task] = results.figures_of({**named, **rules})
-    title = "Planners: searches in equal time, and rules after a failure"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
+        report.figures[task] = results.figures_of({**named, **rules})
+    return report
+
+
+def _search_plays(grid: Grid, task: str, searches: Sequence[str]) -> dict[str, list[str]]:
+    """Search -> names of its cells, one per training seed.
+
+    One cell times the searches for all seeds: times depend on the networks' sizes alone.
+    """
+    plays = {}
+    for name in searches:
+        budget = {"budget_ms": grid.config.play.budget_ms}
+        timing = grid.study("plan_time", task, budget, exclusive=True)
+        options = ("optimiser", "iterations", "samples", "elites")
+        flags = {f"planner.{o}": CellFigure(timing, ("searches", name, o)) for o in options}
+        plays[name] = grid.plays(task, f"search_{name}", flags)
+    return plays
 
 
 def _timings(task: str, timed: Mapping[str, Any], played: Mapping[str, EvalScores]) -> Table:
     columns = ("samples", "iterations", "elites")
-    rows = tuple(
+    rows = [
         (name, *(str(row[column]) for column in columns), f"{row['plan_ms']:.1f}")
         for name, row in timed.items()
         if name in played
-    )
+    ]
     head = ("search", "candidates", "iterations", "elites", "plan (ms)")
     return Table(f"{task}: searches in equal time", head, rows)
 
@@ -110,8 +98,7 @@ def _conclusions(
     if different:
         return [
             f"{task}, {kind}: reward per step minus that of `{reference}`, intervals without "
-            f"zero: "
-            f"{', '.join(different)}"
+            f"zero: {', '.join(different)}"
         ]
     return [
         f"{task}, {kind}: none of {len(scores) - 1} differs from `{reference}` "

@@ -7,38 +7,31 @@ play-TASK-ppo_TRANSITIONS-sSEED       a policy along it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
 from egovcp.sim.config import evaluation_config
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
-from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import BOUNDS, DEFAULT, Grid, Variant
-from egovcp_experiment.report import ExperimentReport, Part, percent
+from egovcp_experiment.grid import BOUNDS, Grid
+from egovcp_experiment.report import ExperimentReport, percent
 
-SUMMARY: Final = "PPO, the model-free baseline, along its training, next to the planner"
 _PLANNER: Final = "planner"
 
 
-def ppo_plays(grid: Grid, task: str) -> dict[int, list[str]]:
-    """Transitions -> names of the cells that play the policy, one per seed."""
+def ppo_scores(grid: Grid, task: str, records: results.Records) -> dict[int, EvalScores]:
+    """Transitions -> scores of the policy; none with ``--ppo.steps=0``."""
     config = grid.config.ppo
-    found: dict[int, list[str]] = {}
+    plays: dict[int, list[str]] = {}
     for seed in grid.config.train.seeds:
         for k, transitions in enumerate(config.transitions):
             path = f"checkpoints/{config.updates * (k + 1):06d}/{PPO_POLICY}"
             policy = CellOutput(_training(grid, task, seed).name, path)
             flags = {**grid.scenarios(task), "controllers": "ppo", "ppo.path": policy}
             cell = grid.add(Cell(f"play-{task}-ppo_{transitions}-s{seed}", PLAY, flags))
-            found.setdefault(transitions, []).append(cell.name)
-    return found
-
-
-def ppo_scores(grid: Grid, task: str, records: results.Records) -> dict[int, EvalScores]:
-    """Transitions -> scores of PPO."""
-    return results.all_scores(records, ppo_plays(grid, task), task, "ppo")
+            plays.setdefault(transitions, []).append(cell.name)
+    return results.all_scores(records, plays, task, "ppo")
 
 
 def _training(grid: Grid, task: str, seed: int) -> Cell:
@@ -69,55 +62,39 @@ def steps_text(count: int) -> str:
     return f"{count / 1000:.0f}k steps" if count >= 10_000 else f"{count} steps"
 
 
-def _plays(grid: Grid, task: str) -> list[str]:
-    """Names of the planner's cells; adds those of PPO and the references."""
-    names = grid.plays(task, Variant(DEFAULT))
-    ppo_plays(grid, task)
-    grid.bounds(task)
-    return names
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
+    config = grid.config
     if not config.ppo.steps:
         raise UsageError("--ppo.steps=0 leaves PPO out; expected at least 1 here")
-    grid = Grid(config)
+    report = ExperimentReport(
+        "PPO, without a model, next to the planner",
+        parts=[
+            f"PPO was trained in the simulator for {config.ppo.transitions[-1]} transitions of "
+            "each task, with the observation, actions, rewards, delays and noise of the planner, "
+            f"and played as it was after {', '.join(map(str, config.ppo.transitions))}. The "
+            "planner has its model from random data that were collected once. If its curve still "
+            "rises at the end, PPO was stopped too early to be judged."
+        ],
+    )
     for task in config.tasks:
-        _plays(grid, task)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    grid = Grid(config)
-    shows: list[str] = []
-    parts: list[Part] = [
-        f"PPO was trained in the simulator for {config.ppo.transitions[-1]} transitions of each "
-        "task, with the observation, actions, rewards, delays and noise of the planner, and played "
-        f"as it was after {', '.join(map(str, config.ppo.transitions))}. The planner has its model "
-        "from random data that were collected once. If its curve still rises at the end, PPO "
-        "was stopped too early to be judged."
-    ]
-    figures: dict[str, Any] = {}
-    for task in config.tasks:
-        planner = results.eval_scores(records, _plays(grid, task), task)
+        planner = results.eval_scores(records, grid.plays(task), task)
         ppo = ppo_scores(grid, task, records)
-        bounds = results.controller_scores(records, f"bounds-{task}", task, BOUNDS)
+        bounds = results.controller_scores(records, grid.bounds(task), task, BOUNDS)
         ours = {} if planner is None else {_PLANNER: planner}
         shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **bounds}
         if ppo:
-            episodes = getattr(config.data.episodes, task)
-            offline = round(episodes * steps_per_episode(grid, task, records))
+            offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
             curves = [results.Curve("PPO", ppo, "C1", "x--")]
             if planner is not None:
                 curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
             caption = f"{task}: success and reward against transitions"
-            parts.append(results.learning_curves(task, caption, curves))
-            shows += _conclusions(task, offline, planner, ppo, bounds)
-            figures[task] = {"planner_transitions": offline}
+            report.parts.append(results.learning_curves(task, caption, curves))
+            report.shows += _conclusions(task, offline, planner, ppo, bounds)
+            report.figures[task] = {"planner_transitions": offline}
         if shown:
-            parts.append(results.comparison(task, shown, _PLANNER))
-            figures.setdefault(task, {}).update(results.figures_of(shown))
-    title = "PPO, without a model, next to the planner"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
+            report.parts.append(results.comparison(task, shown, _PLANNER))
+            report.figures.setdefault(task, {}).update(results.figures_of(shown))
+    return report
 
 
 def _conclusions(

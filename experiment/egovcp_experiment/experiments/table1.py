@@ -12,23 +12,11 @@ from typing import Any, Final
 
 from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell, Flags
+from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import BOUNDS, Grid, Model, Variant
-from egovcp_experiment.report import (
-    ExperimentReport,
-    Part,
-    Table,
-    number,
-    percent,
-)
+from egovcp_experiment.grid import BOUNDS, Grid
+from egovcp_experiment.report import ExperimentReport, Table, number, percent
 
-SUMMARY: Final = (
-    "horizons, ARWM, Rew-MPC and TD-MPC next to ours; tests of the paper's ordering (table I)"
-)
-
-type PlayCells = dict[str, dict[str, dict[int, str]]]
-"""Task -> row -> training seed -> name of the cell."""
 type Scores = dict[str, dict[str, EvalScores]]
 """Task -> row -> scores."""
 
@@ -157,44 +145,21 @@ CLAIMS: Final = (
 _FIRST: Final = (OURS, "arwm", "td_mpc_td")  # under --most: one row of each model
 
 
-def _rows(config: ExperimentConfig) -> dict[str, Row]:
-    """The chosen rows in the order of the table."""
-    chosen = config.chosen(dict.fromkeys([*_FIRST, *ROWS]))
-    return {name: row for name, row in ROWS.items() if name in chosen}
-
-
-def _model(config: ExperimentConfig, name: str) -> Model:
-    """A model with equal steps and no time limit, so that slower models do not learn less."""
-    equal = {"steps": config.train.compared_steps, "max_minutes": 0}
-    return Model(name, {**equal, **MODELS[name]})
-
-
-def _plays(grid: Grid) -> PlayCells:
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    found: PlayCells = {}
-    for task in config.tasks:
-        for name, row in _rows(config).items():
-            names = grid.plays(task, Variant(name, _model(config, row.model), row.play))
-            found.setdefault(task, {})[name] = dict(zip(config.train.seeds, names, strict=True))
-    return found
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
-    _plays(grid)
-    for task in config.tasks:
-        grid.bounds(task)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    grid = Grid(config)
-    plays = _plays(grid)
-    named = {task: {n: [*seeds.values()] for n, seeds in r.items()} for task, r in plays.items()}
+    chosen = config.chosen(dict.fromkeys([*_FIRST, *ROWS]))
+    plays = {
+        task: {
+            name: grid.plays(task, name, row.play, grid.compared(row.model, MODELS[row.model]))
+            for name, row in ROWS.items()
+            if name in chosen
+        }
+        for task in config.tasks
+    }
     scores = {
         task: found
-        for task, rows in named.items()
-        if (found := results.all_scores(records, rows, task))
+        for task, cells in plays.items()
+        if (found := results.all_scores(records, cells, task))
     }
     verdicts = [
         verdict
@@ -202,32 +167,44 @@ def report(config: ExperimentConfig, records: results.Records) -> ExperimentRepo
         for task in claim.tasks
         if (verdict := judge(claim, task, plays.get(task, {}), records)) is not None
     ]
-    parts: list[Part] = [_introduction(config)]
-    parts += [_summary(scores)] if scores else []
-    parts += [_claims_table(verdicts)] if verdicts else []
-    figures: dict[str, Any] = {"claims": [v.figures() for v in verdicts]}
-    for task, found_rows in scores.items():
-        bounds = results.controller_scores(records, f"bounds-{task}", task, BOUNDS)
-        titled = {ROWS[name].title: each for name, each in found_rows.items()}
-        ours = ROWS[OURS].title
-        parts.append(results.comparison(task, {**titled, **bounds}, ours))
-        parts.append(results.comparison_plot(task, task, titled, ours))
-        figures[task] = results.figures_of({**found_rows, **bounds})
-    title = "Table I: horizons, autoregressive training and other objectives"
-    return ExperimentReport(title, tuple(_conclusions(verdicts, scores)), tuple(parts), figures)
+    report = ExperimentReport(
+        "Table I: horizons, autoregressive training and other objectives",
+        _conclusions(verdicts, scores),
+        [_introduction(config)],
+        {"claims": [v.figures() for v in verdicts]},
+    )
+    if scores:
+        report.parts.append(_summary(scores))
+    if verdicts:
+        head = (
+            *("the paper's claim", "task", "here", "success (points)", "95 %", "reward/step"),
+            *("95 %", "trainings", "the paper's reward"),
+        )
+        title = "Differences, above - below, on the same scenarios"
+        report.parts.append(Table(title, head, [verdict.row() for verdict in verdicts]))
+    for task in config.tasks:
+        cell = grid.bounds(task)
+        if task in scores:
+            bounds = results.controller_scores(records, cell, task, BOUNDS)
+            titled = {ROWS[name].title: each for name, each in scores[task].items()}
+            ours = ROWS[OURS].title
+            report.parts.append(results.comparison(task, {**titled, **bounds}, ours))
+            report.parts.append(results.comparison_plot(task, task, titled, ours))
+            report.figures[task] = results.figures_of({**scores[task], **bounds})
+    return report
 
 
 def judge(
-    claim: Claim, task: str, rows: Mapping[str, Mapping[int, str]], records: results.Records
+    claim: Claim, task: str, rows: Mapping[str, Sequence[str]], records: results.Records
 ) -> Verdict | None:
     """The verdict from the trainings that both rows have; None without any.
 
-    ``rows``: row -> training seed -> name of the cell.
+    ``rows``: row -> names of its cells, one per training seed.
     """
-    above, below = rows.get(claim.above, {}), rows.get(claim.below, {})
-    both = [s for s in above if above[s] in records and below.get(s) in records]
-    ours = results.eval_scores(records, [above[s] for s in both], task)
-    theirs = results.eval_scores(records, [below[s] for s in both], task)
+    pairs = zip(rows.get(claim.above, ()), rows.get(claim.below, ()), strict=False)
+    both = [(above, below) for above, below in pairs if above in records and below in records]
+    ours = results.eval_scores(records, [above for above, _ in both], task)
+    theirs = results.eval_scores(records, [below for _, below in both], task)
     if ours is None or theirs is None:
         return None
     return Verdict(
@@ -305,19 +282,10 @@ def _summary(scores: Scores) -> Table:
             spread = "" if each.reward_spread is None else f" ± {each.reward_spread:.4f}"
             trials = number(each.reward_trial_spread, ".4f")
             line += [f"{reward}{spread}", trials, percent(each.success_rate)]
-        lines.append(tuple(line))
+        lines.append(line)
     heads = [h for task in scores for h in (f"{task}: reward/step", "sd of trials", "success")]
     title = (
         "Reward per step, ± its standard deviation over trainings where there are several; a trial "
         "is a tenth of the scenarios with one training"
     )
-    return Table(title, ("", *heads), tuple(lines))
-
-
-def _claims_table(verdicts: Sequence[Verdict]) -> Table:
-    head = (
-        *("the paper's claim", "task", "here", "success (points)", "95 %", "reward/step", "95 %"),
-        *("trainings", "the paper's reward"),
-    )
-    title = "Differences, above - below, on the same scenarios"
-    return Table(title, head, tuple(verdict.row() for verdict in verdicts))
+    return Table(title, ("", *heads), lines)

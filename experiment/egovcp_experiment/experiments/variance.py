@@ -10,75 +10,50 @@ import numpy as np
 
 from egovcp.eval_scores import EvalScores, signed_range
 from egovcp_experiment import results
-from egovcp_experiment.cell import Cell
-from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import Grid, Variant
-from egovcp_experiment.report import ExperimentReport, Part, Plot, Table, draw
+from egovcp_experiment.grid import Grid
+from egovcp_experiment.report import ExperimentReport, Plot, Table, draw
 from egovcp_experiment.studies.residuals import STEPS
 
-SUMMARY: Final = (
-    "do the errors of Q along a plan average out, and predict the best horizon (section III-D)?"
-)
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
 _WALK: Final = ("--eta", "--step_ticks", "--boundary")  # flags of egovcp-collect
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 
-def _residuals(grid: Grid, task: str) -> str:
-    """Name of the cell of the study."""
+def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
     walk = [flag for flag in config.data.flags if flag.partition("=")[0] in _WALK]
-    return grid.sim_study("residuals", task, flags, walk)
-
-
-def _plays(grid: Grid, task: str) -> dict[int, list[str]]:
-    """Horizon -> names of its cells, one per seed."""
-    return {
-        n: grid.plays(task, Variant(f"horizon_{n}", play={"planner.horizon": n})) for n in _HORIZONS
-    }
-
-
-def cells(config: ExperimentConfig) -> list[Cell]:
-    grid = Grid(config)
+    report = ExperimentReport(
+        "Variance: do the errors of Q along a plan average out?",
+        parts=[
+            "Residuals are Q along an imagined plan minus the mean return of random walks that the "
+            "simulator takes from the same step of the same plan; the variance of that mean is "
+            "taken off. Bounds use the largest correlation between two steps and the least and "
+            "largest variance, as in the paper. `cutting`: returns as in training minus returns to "
+            "the end of the episode."
+        ],
+    )
     for task in config.tasks:
-        _residuals(grid, task)
-        _plays(grid, task)
-    return grid.cells
-
-
-def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
-    grid = Grid(config)
-    shows: list[str] = []
-    parts: list[Part] = [
-        "Residuals are Q along an imagined plan minus the mean return of random walks that the "
-        "simulator takes from the same step of the same plan; the variance of that mean is taken "
-        "off. Bounds use the largest correlation between two steps and the least and largest "
-        "variance, as in the paper. `cutting`: returns as in training minus returns to the end of "
-        "the episode."
-    ]
-    figures: dict[str, Any] = {}
-    for task in config.tasks:
-        scores = results.all_scores(records, _plays(grid, task), task)
-        figures[task] = {"horizons": results.figures_of(scores)}
-        record = records.get(_residuals(grid, task))
-        if record is not None:
-            plans = record["figures"]["plans"]
-            figures[task]["residuals"] = plans
+        flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
+        cell = grid.sim_study("residuals", task, flags, walk)
+        plays = {n: grid.plays(task, f"horizon_{n}", {"planner.horizon": n}) for n in _HORIZONS}
+        scores = results.all_scores(records, plays, task)
+        report.figures[task] = {"horizons": results.figures_of(scores)}
+        if cell in records:
+            plans = records[cell]["figures"]["plans"]
+            report.figures[task]["residuals"] = plans
             known = {kind: row for kind, row in plans.items() if "horizons" in row}
-            parts += [_table(task, kind, row) for kind, row in known.items()]
+            report.parts += [_table(task, kind, row) for kind, row in known.items()]
             if known and scores:
-                parts.append(_plot(task, known, scores))
-            shows += _conclusions(task, known, scores)
+                report.parts.append(_plot(task, known, scores))
+            report.shows += _conclusions(task, known, scores)
         if scores:
             rows = {f"N = {n}": each for n, each in scores.items()}
-            parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
-    title = "Variance: do the errors of Q along a plan average out?"
-    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
+            report.parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
+    return report
 
 
 def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
-    rows = tuple(
+    rows = [
         (
             str(at["n"]),
             f"{row['sigma'][k]:.4f}",
@@ -91,7 +66,7 @@ def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
             f"{at['error']:.5f}",
         )
         for k, at in enumerate(row["horizons"])
-    )
+    ]
     head = (
         *("N", "sigma of step N-1", "its bias", "cutting", "Var of J_N's error"),
         *("V_lb", "V_ub", "bias of J_N", "mean square"),

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
-from egovcp.eval_scores import bootstrap, wilson
+from egovcp.eval_scores import Array, bootstrap, wilson
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import PLANNER_HZ
 from egovcp_experiment.config import TASKS
@@ -28,8 +27,6 @@ NEAR_NEUTRAL_M: Final = 0.10  # distance at which a hand is back at its start
 BACK_TICKS: Final = 2 * PLANNER_HZ
 STANDING_M: Final = 0.70
 FAR_M: Final = 0.9  # distance at which an arch needs no crouch
-
-type Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,12 +75,6 @@ class BehaviourTrace:
         window = self.hands_away[start : start + BACK_TICKS]
         back = bool((window < NEAR_NEUTRAL_M).any())
         return back if back or len(window) == BACK_TICKS else None
-
-    @property
-    def far(self) -> NDArray[np.bool_]:
-        """(T,) whether the arch is further than `FAR_M` from the pelvis."""
-        far: NDArray[np.bool_] = np.abs(self.ahead) > FAR_M
-        return far
 
 
 type Traces = list[BehaviourTrace]
@@ -140,12 +131,17 @@ def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str,
     }
 
 
+def _far(trace: BehaviourTrace) -> Any:
+    """(T,) whether the arch is further than `FAR_M` from the pelvis."""
+    return np.abs(trace.ahead) > FAR_M
+
+
 def _arch(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
-    heights = [np.array(t.pelvis)[t.far] for t in [*eventful, *empty]]
+    heights = [np.array(t.pelvis)[_far(t)] for t in [*eventful, *empty]]
     return {
         "pelvis_far": _means(heights),
         "standing_far": _means([(part > STANDING_M).astype(float) for part in heights]),
-        "pelvis_near": _means([np.array(t.pelvis)[~t.far] for t in eventful]),
+        "pelvis_near": _means([np.array(t.pelvis)[~_far(t)] for t in eventful]),
     }
 
 

@@ -6,7 +6,6 @@ imagines under the actions that were sent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
+from egovcp.eval_scores import Array
 from egovcp.model import Carry, WorldModel
-from egovcp.spec import PLANNER_DT
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_DT
 from egovcp_experiment.studies import study
 
 HORIZONS: Final = tuple(range(0, 17, 2))
@@ -24,10 +24,6 @@ HORIZONS: Final = tuple(range(0, 17, 2))
 SEEN_S: Final = {"ball": 0.28, "wall": 0.08, "arch": 1.2}
 _SHOWN: Final = 2  # episodes whose images are kept
 _MOVING_M: Final = 0.2  # change of depth of a moving pixel
-
-type Array = NDArray[np.float64]
-type Images = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
-"""Decoded, true and last observed depth, m; 0: nothing in range."""
 
 
 @dataclass(frozen=True)
@@ -50,17 +46,24 @@ def measure(config: OpenLoopConfig) -> None:
     artifact = config.load()
     recorded = sorted(_clips(artifact, config).items())
     clips = [clip for _, clip in recorded if len(clip.depth) > HORIZONS[-1]]
-    imagined = [_imagine(artifact.world_model, clip) for clip in clips]
-    seen = [np.stack([clip.depth[k] for k in HORIZONS]) / 1e3 for clip in clips]
-    errors = {}
-    for i, k in enumerate(HORIZONS):
-        images = [(f[i], s[i], s[0]) for f, s in zip(imagined, seen, strict=True)]
-        errors[str(k)] = _errors(images)
-    most_moving = sorted(range(len(clips)), key=lambda i: -_moving_share(seen[i]))[:_SHOWN]
-    strips = [
-        {"seen": _centimetres(seen[i]), "imagined": _centimetres(imagined[i])} for i in most_moving
-    ]
-    config.write({"episodes": len(clips), "errors_m": errors, "strips": strips})
+    shape = (len(clips), len(HORIZONS), DEPTH_ROWS, DEPTH_COLS)  # also without clips
+    imagined = np.reshape([_imagine(artifact.world_model, clip) for clip in clips], shape)
+    seen = np.reshape([[clip.depth[k] for k in HORIZONS] for clip in clips], shape) / 1e3
+    moving = abs(seen[:, 1:] - seen[:, :1]) > _MOVING_M
+    most_moving = np.argsort(-moving.mean(axis=(1, 2, 3)), kind="stable")[:_SHOWN]
+    config.write(
+        {
+            "episodes": len(clips),
+            "errors_m": {
+                str(k): _errors(imagined[:, i], seen[:, i], seen[:, 0])
+                for i, k in enumerate(HORIZONS)
+            },
+            "strips": [
+                {"seen": _centimetres(seen[i]), "imagined": _centimetres(imagined[i])}
+                for i in most_moving
+            ],
+        }
+    )
 
 
 def _clips(artifact: Artifact, config: OpenLoopConfig) -> dict[int, _Clip]:
@@ -90,12 +93,9 @@ def _imagine(model: WorldModel, clip: _Clip) -> Array:
     return np.stack(images)
 
 
-def _errors(images: Sequence[Images]) -> dict[str, Any]:
+def _errors(model: Array, truth: Array, last: Array) -> dict[str, float | None]:
     """Mean absolute error over pixels in range, and over moving ones, of the model and of the last
-    observed image repeated."""
-    if not images:
-        return dict.fromkeys(("model", "repeat", "model_moving", "repeat_moving"))
-    model, truth, last = (np.stack(parts) for parts in zip(*images, strict=True))
+    observed image repeated; (C, H, W) m, 0: nothing in range."""
     valid = (truth > 0) & (last > 0)
     moving = valid & (abs(truth - last) > _MOVING_M)
     return {
@@ -110,13 +110,8 @@ def _mean(values: NDArray[Any], where: NDArray[np.bool_]) -> float | None:
     return float(values[where].mean()) if where.any() else None
 
 
-def _moving_share(seen: NDArray[Any]) -> float:
-    return float((abs(seen[1:] - seen[:1]) > _MOVING_M).mean())
-
-
-def _centimetres(images: NDArray[Any]) -> list[Any]:
-    whole: list[Any] = np.rint(100 * images).astype(int).tolist()
-    return whole
+def _centimetres(images: Array) -> Any:
+    return np.rint(100 * images).astype(int).tolist()
 
 
 main = study.make_main("open_loop", OpenLoopConfig, measure)

@@ -56,7 +56,7 @@ def measure(config: PlanTimeConfig) -> None:
                 optimiser=optimiser,
                 iterations=iterations,
                 samples=samples,
-                elites=_elites(artifact.planner, samples),
+                elites=min(artifact.planner.elites, samples // 2),
             )
             policies[name, samples] = artifact.make_policy(planner=planner)
             policies[name, samples].prepare()
@@ -68,11 +68,6 @@ def measure(config: PlanTimeConfig) -> None:
         for name in SEARCHES
     }
     config.write({"budget_ms": config.budget_ms, "searches": searches})
-
-
-def _elites(planner: PlannerConfig, samples: int) -> int:
-    """The planner's number of elites, at most half of the candidates (docs/planner.md)."""
-    return min(planner.elites, samples // 2)
 
 
 def _median_times[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:
@@ -101,7 +96,7 @@ def _affordable(
         "optimiser": optimiser,
         "iterations": iterations,
         "samples": samples,
-        "elites": _elites(planner, samples),
+        "elites": min(planner.elites, samples // 2),  # docs/planner.md
         "plan_ms": few_ms + slope * (samples - _FEW),
         "measured_ms": {str(_FEW): few_ms, str(_MANY): many_ms},
     }

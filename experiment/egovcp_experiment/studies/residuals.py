@@ -18,16 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact, returns_of
 from egovcp.bounds import bounded
 from egovcp.errors import UsageError
+from egovcp.eval_scores import Array
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.search import random_walk
 from egovcp.sim.config import EnvConfig
@@ -40,8 +40,6 @@ from egovcp_experiment.studies import study
 STEPS: Final = 6  # the longest horizon of table I
 #: Ticks from the event to the plan; episodes take them in turn.
 _AFTER: Final = {"ball": (-5, 4, 8, 12, 16), "wall": (-5, 1, 4, 8), "arch": (-2, 20, 40, 60, 80)}
-
-type Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -117,19 +115,22 @@ def measure(config: ResidualsConfig) -> None:
     returns = returns_of(artifact)
     starts = _starts(artifact, config)
     walk = RandomWalk(config.eta, config.boundary, config.step_ticks)
-    found: dict[str, list[Residuals]] = {}
+    found: dict[str, list[tuple[Array, Array, Array]]] = {}
     for number, start in enumerate(tqdm(starts, unit="plan", desc="branch")):
         for kind, plan in start.plans.items():
             rngs = np.random.default_rng([config.seed, number]).spawn(STEPS * config.branches)
             simulated = _branches(config.env, start, plan, walk, rngs, returns.gamma, returns.steps)
-            found.setdefault(kind, []).append(Residuals(start.values[kind], *simulated))
+            found.setdefault(kind, []).append((start.values[kind], *simulated))
     config.write(
         {
             "task": config.task,
             "branches": config.branches,
             "return_steps": returns.steps,
             "return_std": float(artifact.world_model.return_std),
-            "plans": {kind: analysis(rows) for kind, rows in found.items()},
+            "plans": {
+                kind: analysis(*map(np.stack, zip(*rows, strict=True)))
+                for kind, rows in found.items()
+            },
         }
     )
 
@@ -170,28 +171,23 @@ def _branches(
     return short.reshape(STEPS, -1), whole.reshape(STEPS, -1)
 
 
-class Residuals(NamedTuple):
-    """One plan of K steps."""
+def analysis(value: Array, short: Array, whole: Array) -> dict[str, Any]:
+    """Variances, correlations, bounds and biases; needs at least three plans.
 
-    value: Array
-    """(K,) Q^ along the plan."""
-    short: Array
-    """(K, R) returns of random walks from each step on, with the horizon of training."""
-    whole: Array
-    """(K, R) the same to the end of the episode."""
-
-
-def analysis(plans: Sequence[Residuals]) -> dict[str, Any]:
-    """Variances, correlations, bounds and biases; needs at least three plans."""
-    if len(plans) < 3:
-        return {"plans": len(plans)}
-    errors = np.stack([p.value - p.short.mean(1) for p in plans])  # (P, K)
-    noise = np.stack([p.short.var(1, ddof=1) / p.short.shape[1] for p in plans]).mean(0)
+    Args:
+        value: (P, K) Q^ along P plans of K steps.
+        short: (P, K, R) returns of random walks from each step, with the horizon of training.
+        whole: (P, K, R) the same to the end of the episode.
+    """
+    if len(value) < 3:
+        return {"plans": len(value)}
+    errors = value - short.mean(2)  # (P, K)
+    noise = (short.var(2, ddof=1) / short.shape[2]).mean(0)
     covariance = _positive(np.cov(errors.T, ddof=1) - np.diag(noise))
     rho = _correlation(covariance)
-    cut = np.stack([(p.short - p.whole).mean(1) for p in plans])
+    cut = (short - whole).mean(2)
     return {
-        "plans": len(plans),
+        "plans": len(value),
         "sigma": np.sqrt(np.diag(covariance)).tolist(),
         "rho": rho.tolist(),
         "rho_max": _largest(rho),

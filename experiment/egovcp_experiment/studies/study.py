@@ -18,7 +18,7 @@ from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
-from egovcp.model import Carry, WorldModel
+from egovcp.model import Carry
 from egovcp.plan import PolicyStep
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.robot.controllers import make_controller
@@ -119,7 +119,6 @@ class PlayedStep:
     """One per row."""
     env: VectorEnv
     """After the step."""
-    model: WorldModel
     state: PrivilegedState
     """Before the step."""
     carry: Carry
@@ -149,6 +148,6 @@ def play_episodes(
                 before = (env.privileged_state(), policy.carry.map(torch.clone), np.array(env.tick))
                 result = env.step(plan.action)
                 policy.advance(result.sent_action)
-                yield PlayedStep(group, env, policy.model, *before, live, observation, plan, result)
+                yield PlayedStep(group, env, *before, live, observation, plan, result)
                 observation = result.observation
             bar.update(len(group))

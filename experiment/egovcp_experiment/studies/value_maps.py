@@ -38,13 +38,7 @@ class _Map:
     tick: int
     hand: Literal["left", "right"]
     values: NDArray[np.float64]  # (n, m) over z, x
-
-    @property
-    def best(self) -> tuple[float, float]:
-        """x and z of the largest value, m."""
-        grid = hand_grid(self.hand)
-        z, x = np.unravel_index(int(self.values.argmax()), self.values.shape)
-        return float(grid.x[x]), float(grid.z[z])
+    best: tuple[float, float]  # x and z of the largest value, m
 
 
 type Aims = dict[int, tuple[float, float]]
@@ -62,11 +56,13 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
             name = _due(float(step.state.since_event[row]), facts["flight"])
             if name and (episode, name) not in maps:
                 hand: Literal["left", "right"] = "left" if facts["aim_lateral"] > 0 else "right"
-                carry = step.carry.row(row)
+                grid, carry = hand_grid(hand), step.carry.row(row)
                 action = torch.as_tensor(step.plan.action[row : row + 1]).to(carry.h)
-                values = value_map(step.model, carry, action, hand, hand_grid(hand))
-                found = values[0].double().cpu().numpy()
-                maps[episode, name] = _Map(episode, name, int(step.tick[row]), hand, found)
+                values = value_map(artifact.world_model, carry, action, hand, grid)[0]
+                found = values.double().cpu().numpy()
+                z, x = np.unravel_index(int(found.argmax()), found.shape)
+                best = (float(grid.x[x]), float(grid.z[z]))
+                maps[episode, name] = _Map(episode, name, int(step.tick[row]), hand, found, best)
     return list(maps.values()), aims
 
 
@@ -113,18 +109,13 @@ def _shown(maps: list[_Map], aims: Aims) -> dict[str, Any]:
     chosen = max(sorted(spread), key=spread.__getitem__)
     shown = [m for m in maps if m.episode == chosen]
     grid = hand_grid(shown[0].hand)
+    names = ("moment", "tick", "hand", "best")
     return {
         "x": grid.x.tolist(),
         "z": grid.z.tolist(),
         "aim": list(aims[chosen]),
         "maps": [
-            {
-                "moment": m.moment,
-                "tick": m.tick,
-                "hand": m.hand,
-                "values": m.values.tolist(),
-                "best": m.best,
-            }
+            {"values": m.values.tolist(), **{name: getattr(m, name) for name in names}}
             for m in shown
         ],
     }

@@ -17,8 +17,7 @@ from egovcp.errors import UsageError
 from egovcp.help_text import field_docs
 from egovcp.sim.tasks import task_names
 from egovcp_collect.dataset import card
-from egovcp_collect.dataset.card import CardConfig, card_text
-from egovcp_collect.dataset.card_tables import settings_tables
+from egovcp_collect.dataset.card import CardConfig, card_text, settings_tables
 from egovcp_collect.dataset.cli import main
 
 from .conftest import write

@@ -80,7 +80,7 @@ DAMAGE: dict[str, tuple[str, d.Damage, str, int | None, str]] = {
     "length in table": (
         "arm", of_table(length=item(1, 15)), d.DATA, 1, "gives it 15 frames, but it has 12",
     ),
-    "episode twice": ("arm", of_table(episode_index=item(2, 1)), d.EPISODES, 1, "listed twice"),
+    "episode twice": ("arm", of_table(episode_index=item(2, 1)), d.EPISODES, 1, "listed in row 2"),
     "rows of another episode": (
         "arm", rows_of(d.DATA, episode_index=lambda v: v.__setitem__(slice(8, 20), [0] * 12)),
         d.DATA, 0, "of another episode",

@@ -28,7 +28,7 @@ CONFIG = ExperimentConfig(
 def test_played_policies_are_saved_ones() -> None:
     cells = {cell.name: cell for cell in PPO.cells(CONFIG)}
     training = cells["ppo-ball-s3"]
-    argv = CellStore(Path("out")).prepare(training, {})
+    argv = CellStore(Path("out")).prepare(training)
     assert argv == [
         "--output_dir=out/work/ppo-ball-s3",
         "--task=ball",

@@ -68,7 +68,7 @@ def report(name: str, share: float) -> ExperimentReport:
 def test_every_report_works_without_results(name: str) -> None:
     found = EXPERIMENTS[name].report(SCALES["small"](), {})
     assert found.title
-    assert found.shows == ()
+    assert found.shows == []
     assert not [part for part in found.parts if isinstance(part, Plot)]
 
 

@@ -163,11 +163,11 @@ def test_a_claim_uses_the_trainings_of_both_rows() -> None:
         "b0": record("ball", 0.0, 0.5, rng),
     }
     claim = Claim("a", "b", ("ball",))
-    rows = {"a": {0: "a0", 1: "a1"}, "b": {0: "b0", 1: "b1"}}
+    rows = {"a": ["a0", "a1"], "b": ["b0", "b1"]}
     verdict = judge(claim, "ball", rows, records)
     assert verdict is not None
     assert (verdict.seeds, verdict.word, verdict.gain.success) == (1, "undecided", 0.0)
-    assert judge(claim, "ball", {"a": {1: "a1"}, "b": {1: "b1"}}, records) is None
+    assert judge(claim, "ball", {"a": ["a1"], "b": ["b1"]}, records) is None
 
 
 def test_verdicts_are_counted() -> None:

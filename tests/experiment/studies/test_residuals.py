@@ -13,7 +13,6 @@ from egovcp.sim.scenario import Scenario
 from egovcp_experiment.cell import read_json
 from egovcp_experiment.studies.residuals import (
     STEPS,
-    Residuals,
     _branches,
     _Start,
     analysis,
@@ -74,7 +73,9 @@ def test_the_study_measures_both_kinds_of_plans(flags: list[str], tmp_path: Path
         assert [at["n"] for at in row["horizons"]] == list(range(1, STEPS + 1))
 
 
-def plans(rho: float, noise: float, bias: float = 0.0, count: int = 4000) -> list[Residuals]:
+def plans(
+    rho: float, noise: float, bias: float = 0.0, count: int = 4000
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors of deviation 0.5 whose steps correlate by rho; returns of 4 walks with that noise."""
     rng = np.random.default_rng(0)
     steps, walks = 4, 4
@@ -82,12 +83,12 @@ def plans(rho: float, noise: float, bias: float = 0.0, count: int = 4000) -> lis
     errors = 0.5 * (common + rng.normal(size=(count, steps)) * (1 - rho) ** 0.5) + bias
     truth = rng.normal(size=(count, steps))
     returns = truth[:, :, None] + noise * rng.normal(size=(count, steps, walks))
-    return [Residuals(truth[p] + errors[p], returns[p], returns[p] - 0.25) for p in range(count)]
+    return truth + errors, returns, returns - 0.25
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_noise_of_the_returns_is_subtracted(rho: float) -> None:
-    found = analysis(plans(rho, noise=2.0, bias=0.1))
+    found = analysis(*plans(rho, noise=2.0, bias=0.1))
     np.testing.assert_allclose(found["sigma"], 0.5, atol=0.06)
     assert found["rho_next"] == pytest.approx(rho, abs=0.12)
     np.testing.assert_allclose(found["bias"], 0.1, atol=0.06)
@@ -96,7 +97,7 @@ def test_noise_of_the_returns_is_subtracted(rho: float) -> None:
 
 @pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])
 def test_the_variance_of_a_mean_lies_between_its_bounds(rho: float) -> None:
-    for at in analysis(plans(rho, noise=0.0))["horizons"]:
+    for at in analysis(*plans(rho, noise=0.0))["horizons"]:
         n = at["n"]
         assert at["variance"] == pytest.approx(0.25 * (1 + (n - 1) * rho) / n, rel=0.1)
         assert at["v_lb"] <= at["variance"] * 1.001
@@ -112,4 +113,4 @@ def test_the_bounds_are_those_of_the_paper() -> None:
 
 
 def test_two_plans_are_too_few() -> None:
-    assert analysis(plans(0.0, 1.0, count=2)) == {"plans": 2}
+    assert analysis(*plans(0.0, 1.0, count=2)) == {"plans": 2}
