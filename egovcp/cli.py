@@ -5,8 +5,8 @@ A command is a dataclass of options and a function::
     def main(argv: Sequence[str] | None = None) -> int:
         return run_command(CollectConfig, collect, argv, prog="egovcp-collect")
 
-Exit codes: 0 done, 2 usage, 3 data, 4 artifact, 5 environment, 6 safety stop; 130
-after an interrupt. A traceback is printed only with ``--debug``.
+Exit codes: see `egovcp.errors`; 130 after an interrupt; 1 after a bug, which prints a traceback.
+Errors that a user caused print one only with ``--debug``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from egovcp.bounds import bounded, check_bounds, check_cores
 from egovcp.entry_point import INTERRUPTED, raise_on_sigint
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.files import write_text
-from egovcp.flags import HELP, flag_values, merged, split_flags
+from egovcp.flags import HELP, config_file, flag_values, merged, split_flags
 from egovcp.help_text import help_text
 from egovcp.outputs import check_output_files
 from egovcp.terminal import echo, one_line, without_token
@@ -40,11 +40,11 @@ class DatasetConfig:
     """A LeRobot dataset on the Hub or on disk."""
 
     repo_id: str = ""
-    """Dataset id, `user/name`; looked up on the Hub unless root holds it."""
+    """Dataset id, `user/name`; it is read from the Hub unless root is given."""
     root: str = ""
-    """Folder of the dataset on disk; empty: the Hub's local cache."""
+    """Folder of the dataset on disk; empty: $HF_LEROBOT_HOME/REPO_ID, or a download."""
     revision: str = ""
-    """Branch, tag or commit SHA on the Hub; empty: the latest."""
+    """Branch, tag or commit SHA on the Hub; empty: main."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class SelectedDatasetConfig(DatasetConfig):
     """Dataset and selection of episodes."""
 
     episodes: str = ""
-    """Only these episodes: numbers, `[0, 5, 7]`, a range whose end is excluded, `0:1334`, or both,
+    """Only these episodes: numbers, `[0, 5, 7]`, ranges as in Python, `0:1334`, or both,
     `[0:100, 250]`; empty: all."""
 
 
@@ -141,18 +141,20 @@ def given_options(argv: Sequence[str]) -> dict[str, str]:
 def preset_defaults(
     presets: Mapping[str, Callable[[], object]], argv: Sequence[str]
 ) -> dict[str, Any]:
-    """The options of the preset that ``--preset`` names; empty without a known one.
+    """The options of the preset that ``--preset`` or the config file names; empty without a known
+    one.
 
     Raises:
-        UsageError: a config file, which has all options, would hide the preset.
+        UsageError: both are given, or the file cannot be read.
     """
     given = given_options(argv)
     if "preset" in given and "config_path" in given:
         raise UsageError(
             f"--preset={given['preset']} and --config_path={given['config_path']} both set "
-            "all options; give one of them, and single options as flags"
+            "options; give one of them, and single options as flags; a file may name a preset"
         )
-    name = given.get("preset", "")
+    file = config_file(given["config_path"]) if given.get("config_path") else {}
+    name = given.get("preset") or str(file.get("preset", ""))
     return dict(draccus.encode(presets[name]())) if name in presets else {}
 
 

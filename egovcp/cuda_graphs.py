@@ -59,7 +59,7 @@ class GraphedFunction:
         function: takes and returns tensors, None, or tuples of them; without synchronisation,
             random numbers and side effects. Arguments other than tensors are part of the shape.
         capture: makes a graph, or raises `RuntimeError`; None: `capture_graph`.
-        max_graphs: further shapes are computed without a graph.
+        max_graphs: most shapes that are captured; others run without a graph.
         copies: return copies of the results, which later calls do not overwrite.
     """
 
@@ -91,7 +91,7 @@ class GraphedFunction:
         return _map(graph.results, Tensor.clone) if self._copies else graph.results
 
     @property
-    def shapes(self) -> int:
+    def num_graphs(self) -> int:
         return sum(graph is not None for graph in self._graphs.values())
 
     @torch.inference_mode(False)  # buffers are written under both modes

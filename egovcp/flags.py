@@ -129,7 +129,7 @@ def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
             for part in reversed(flag.removeprefix("--").split(".")):
                 value = {part: value}
             given = merged(given, value)
-    return merged(_config_file(file), given) if file else given
+    return merged(config_file(file), given) if file else given
 
 
 def _value(flag: str, text: str, kind: Any) -> Any:
@@ -163,7 +163,12 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
     return out
 
 
-def _config_file(file: str) -> dict[str, Any]:
+def config_file(file: str) -> dict[str, Any]:
+    """The options in the file of ``--config_path``, nested by group.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
     try:
         return read_config(Path(file))
     except OSError as error:

@@ -54,15 +54,15 @@ class PlannerOptions:
     min_std: float | None = bounded(None, least=0)
     """Smallest sampling standard deviation, in units of eta."""
     action_rate_cost: float | None = bounded(None, least=0)
-    """Cost of action changes per step, times their mean square, where 1 is the largest change."""
+    """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step."""
     pose_cost: float | None = bounded(None, least=0)
-    """Cost of the pose per step, times the mean squared action."""
+    """Coefficient of mean(a_t^2) in the cost of a step."""
     action_parameterization: ActionParameterization | None = None
     """How a sample becomes actions: target (move towards one target, then hold it), or random_walk
     (an independent change at every step)."""
     termination_rule: TerminationRule | None = None
-    """Value of a failed candidate: paper (0), shift (lowest return of the data), or survival
-    (weighted by the probability of survival)."""
+    """Value of a failed candidate: paper (0), shift (the 0.1 % quantile of the returns in the
+    data), or survival (weighted by the probability of survival)."""
     latent: Latent | None = None
     """z of imagined states: mean or sample of the prior."""
     optimiser: OptimiserName | None = None

@@ -89,6 +89,6 @@ def refuse_removed_flag(flag: str) -> None:
 def refuse_preset_flag(flag: str) -> None:
     """Raise `RemovedOptionError` for an option that only a configuration can set."""
     raise RemovedOptionError(
-        f"option {flag} was removed from the command line: it is a constant of --preset; set it in "
-        "a file, --config_path, or in Python"
+        f"option {flag} is not a flag: it is a constant of --preset; set it in a file, "
+        "--config_path, or in Python"
     )

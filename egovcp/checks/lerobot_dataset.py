@@ -133,7 +133,7 @@ class LeRobotCheck:
                 continue
             number, table = part
             found.add(number)
-            yield from self._episode_problems(path, number, table)
+            yield from self._listed_episode_problems(path, number, table)
             if progress is not None:
                 progress(len(self._seen), max(len(self.reader.rows), len(self._seen)))
         for number in listed:
@@ -170,26 +170,41 @@ class LeRobotCheck:
             key for key, f in features.items() if key not in stats and (f.is_numeric or f.is_camera)
         ]
         videos = self.reader.keys("video")
-        notes = {
-            f"videos ({', '.join(videos)}): PyAV is not installed; "
-            "pip install 'egovcp[video]'": bool(videos) and not self._has_av,
-            f"videos ({', '.join(videos)}): all times are checked, but of each episode only the "
-            "first and the last frame are decoded": bool(videos) and self._has_av,
-            "timestamps against frame_index / fps, which may differ without videos": not videos,
-            f"statistics of cameras ({', '.join(cameras)}) against their pixels, of which LeRobot "
-            "samples some": bool(cameras),
-            f"statistics of {', '.join(lacking)}: none are recorded": bool(lacking and stats),
+        notes = [
             f"statistics of {', '.join(STALE)}, which LeRobot's editing tools copy from their "
-            "source": True,
-            f"content of {', '.join(language)}": bool(language),
-            "reward, success and end of episodes: there is no next.reward or next.done": not (
-                {"next.reward", "next.done"} & features.keys()
-            ),
-            "images/, the frames of an interrupted recording, which LeRobot does not read; remove "
-            "it to save space": bool(files_below(self.reader.root / "images")),
-            "how it was collected: there is no meta/collection.json": True,
-        }
-        return [note for note, applies in notes.items() if applies]
+            "source",
+            "how it was collected: there is no meta/collection.json",
+        ]
+        if videos and self._has_av:
+            notes.append(
+                f"videos ({', '.join(videos)}): all times are checked, but of each episode only "
+                "the first and the last frame are decoded"
+            )
+        elif videos:
+            notes.append(
+                f"videos ({', '.join(videos)}): PyAV is not installed; pip install 'egovcp[video]'"
+            )
+        else:
+            notes.append("timestamps against frame_index / fps, which may differ without videos")
+        if cameras:
+            notes.append(
+                f"statistics of cameras ({', '.join(cameras)}) against their pixels, of which "
+                "LeRobot samples some"
+            )
+        if lacking and stats:
+            notes.append(f"statistics of {', '.join(lacking)}: none are recorded")
+        if language:
+            notes.append(f"content of {', '.join(language)}")
+        if not {"next.reward", "next.done"} & features.keys():
+            notes.append(
+                "reward, success and end of episodes: there is no next.reward or next.done"
+            )
+        if files_below(self.reader.root / "images"):
+            notes.append(
+                "images/, the frames of an interrupted recording, which LeRobot does not read; "
+                "remove it to save space"
+            )
+        return notes
 
     def episode_problems(
         self, path: Path, number: int, table: pa.Table
@@ -246,7 +261,9 @@ class LeRobotCheck:
             if problem:
                 yield DataError.at(path, problem, row.index, frame)
 
-    def _episode_problems(self, path: Path, number: int, table: pa.Table) -> Iterator[DataError]:
+    def _listed_episode_problems(
+        self, path: Path, number: int, table: pa.Table
+    ) -> Iterator[DataError]:
         row = self.by_number.get(number)
         first, self._frames = self._frames, self._frames + (row.length if row else len(table))
         if number in self._seen:
@@ -288,10 +305,8 @@ class LeRobotCheck:
 
 def _row_problems(row: EpisodeRow, number: int, end: int) -> Iterator[str]:
     """Problems of row ``number`` of the table; the episode before it ends at ``end``."""
-    if row.index < number:
-        yield f"listed twice, in row {number} again; episode_index counts from 0"
-    elif row.index > number:
-        yield f"listed in row {number}; episode_index counts from 0"
+    if row.index != number:
+        yield f"listed in row {number}; episode_index counts from 0, and each episode has one row"
     frames = row.end - row.start
     if row.length != frames or row.length < 1:
         place = f"dataset_from_index {row.start} and dataset_to_index {row.end}"

@@ -26,7 +26,9 @@ def resolve_root(root: str | Path) -> Path:
     """
     try:
         return Path(os.path.expanduser(root)).resolve()
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
+        raise UsageError(f"{root}: {error.strerror}; give an absolute path") from error
+    except RuntimeError as error:
         raise UsageError(f"{root} is a loop of symbolic links; remove it") from error
 
 

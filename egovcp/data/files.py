@@ -1,7 +1,5 @@
-"""All changes of a dataset on the disk, and their flushing.
-
-All writers use this module, so that tests can simulate disk failures in one place.
-"""
+"""Writes, renames and flushes of dataset files, in one place, so that tests can simulate disk
+failures."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ ReturnScaling = Literal["dataset", "none"]
 
 @dataclass(frozen=True)
 class ReturnConfig:
-    """The Monte Carlo target of Q."""
+    """Discount, horizon, weights and normalisation of the returns that Q is trained on."""
 
     gamma: float = bounded(spec.GAMMA, least=0, most=1)
     """Discount per planner tick."""

@@ -19,9 +19,9 @@ from egovcp.robot_spec import G1, RobotSpec
 
 type Batch = dict[str, NDArray[Any]]
 
-_FROM_EPISODE: Final = ("depth", "state", "action", "done", "success")
+_FROM_EPISODE: Final = ("depth", "state", "action")
 _VALUES: Final = ("depth", "state", "action", "prev_action", "privileged", "reward", "mc_return")
-_FLAGS: Final = ("done", "success", "terminal_next", "mc_valid")
+_FLAGS: Final = ("terminal_next", "mc_valid")
 
 
 def _arrays(robot: RobotSpec) -> Mapping[str, FrameLayout]:
@@ -56,8 +56,6 @@ class EpisodeStore:
     """(N, F) `egovcp.data.privileged`."""
     reward: NDArray[np.float32]
     """(N,) see `ReturnConfig.target_reward`."""
-    done: NDArray[np.bool_]
-    success: NDArray[np.bool_]
     terminal_next: NDArray[np.bool_]
     """(N,) the row's action led to a failure."""
     mc_return: NDArray[np.float32]
@@ -180,8 +178,8 @@ def gather(
 
 
 def mirror_windows(batch: Batch, windows: NDArray[np.intp], robot: RobotSpec = G1) -> None:
-    """Reflect some windows of a batch of a symmetric robot left to right, in place; its camera is
-    in the plane of symmetry."""
+    """Mirror ``windows`` of a batch left to right, in place; the robot is symmetric and its camera
+    is in the plane of symmetry."""
     batch["depth"][windows] = batch["depth"][windows, ..., ::-1]
     batch["state"][windows] = robot.mirrored_state(batch["state"][windows])
     batch["privileged"][windows] = privileged.mirror_privileged(batch["privileged"][windows])

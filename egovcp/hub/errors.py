@@ -57,7 +57,7 @@ def hub_errors(
 ) -> Iterator[None]:
     """Turn every failure of `huggingface_hub` within the block into an `EgovcpError`.
 
-    The block must call nothing but that library.
+    An `EgovcpError` of the block, and an error of a file, pass through.
 
     Raises:
         DataError: there is no such dataset or revision.

@@ -253,7 +253,9 @@ class _WriterProcess:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_KILL_TIMEOUT_S)
         code = self._process.poll()
-        how = f"by signal {-code}" if code is not None and code < 0 else f"with code {code}"
+        if code is None:
+            return "its writer process closed the pipe"
+        how = f"by signal {-code}" if code < 0 else f"with code {code}"
         return f"its writer process ended {how}"
 
     def kill(self) -> None:

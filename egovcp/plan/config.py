@@ -51,19 +51,18 @@ class PlannerConfig:
     eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
     """Largest action change per step, in units of the action box."""
     action_rate_cost: float = bounded(spec.ACTION_RATE_COST, least=0, most=1e6)
-    """Cost of action changes per step, times their mean square, where 1 is the largest change; that
-    of the data's reward."""
+    """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step; that of the data's
+    reward."""
     pose_cost: float = bounded(spec.POSE_COST, least=0, most=1e6)
-    """Cost of the pose per step, times the mean squared action; that of the data's reward."""
+    """Coefficient of mean(a_t^2) in the cost of a step; that of the data's reward."""
     action_parameterization: ActionParameterization = "target"
     """How a sample becomes actions. target: move towards one target at rate eta, then hold it, like
     the default data of egovcp-collect; random_walk: an independent change at every step."""
     termination_threshold: float = bounded(0.9, least=0, most=1)
     """A candidate is considered failed where its termination probability exceeds this."""
     termination_rule: TerminationRule = "shift"
-    """Value of a failed candidate. paper: zero from then on; shift: a return below 99.9 % of those
-    of the data;
-    survival: values above that are weighted by the probability of survival."""
+    """Value of a failed candidate. paper: zero from then on; shift: the 0.1 % quantile of the
+    returns in the data; survival: values above that are weighted by the probability of survival."""
     latent: Latent = "mean"
     """z of imagined states. mean: the mean of the prior; sample: a sample of it, with the same
     noise for all candidates."""

@@ -164,12 +164,14 @@ class BaseVectorEnv(ABC):
 
     @abstractmethod
     def _in_range(self, position: Array) -> bool:
-        """Whether the camera could see an object at ``position`` (3,), m, base frame."""
+        """Whether ``position`` (3,), m, base frame, is in front of the robot and within the range
+        of the depth camera; its field of view is ignored."""
 
     def known_objects(self) -> NDArray[np.float32]:
         """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
 
-        An object is known while it is in range of the camera and still matters to the task.
+        An object is known while it is in front of the robot, within the depth range, and still
+        matters to the task.
         """
         found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
         for row, task in enumerate(instance.task for instance in self.instances):

@@ -124,7 +124,7 @@ class LimitedConfig:
 def test_option_that_is_not_a_flag_is_refused_on_the_command_line(
     argument: str, option: str
 ) -> None:
-    with pytest.raises(UsageError, match=f"option {option} was removed from the command line"):
+    with pytest.raises(UsageError, match=f"option {option} is not a flag"):
         parse_config(LimitedConfig, [argument], "egovcp-test")
 
 

@@ -70,10 +70,10 @@ class FloatEvaluator:
             self._plan_value = GraphedFunction(self._plan_value)
 
     @property
-    def shapes(self) -> int:
+    def num_graphs(self) -> int:
         """Number of captured CUDA graphs."""
         parts = (self._prefix, self._plan_value)
-        return sum(f.shapes for f in parts if isinstance(f, GraphedFunction))
+        return sum(f.num_graphs for f in parts if isinstance(f, GraphedFunction))
 
     @torch.no_grad()
     def at(self, carry: Carry) -> PlanValue:

@@ -73,7 +73,7 @@ class ArchTask(Task):
     config: ArchConfig = ArchConfig()
     event = "passage begins"
     episode = EpisodeConfig(ticks=230, event_ticks=(5, 25))  # covers the slowest passage
-    event_ticks = 175
+    event_duration_ticks = 175
     needs_walking = True
     in_sequence = "anywhere"
     constant_poses = ((0.0,), (0.0,), (0.0,), (0.0, -0.2, -0.4, -0.6, -0.8, -1.0))

@@ -78,7 +78,7 @@ class BallTask(Task):
     config: BallConfig = BallConfig()
     event = "ball thrown"
     short_episode = EpisodeConfig(ticks=60, event_ticks=(4, 20))
-    event_ticks = 25
+    event_duration_ticks = 25
     in_sequence = "anywhere"
     constant_poses = ((0.2, 0.45, 0.8), (0.0, -0.3, -0.6), (0.35, 0.6, 0.85), (0.0,))
     seed_key = 0

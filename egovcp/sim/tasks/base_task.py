@@ -56,7 +56,7 @@ class BaseTask(ABC):
     """Default of ``--env.<name>_episode.*``; None: there are no such options."""
     short_episode: ClassVar[EpisodeConfig | None] = None
     """Its default in ``egovcp-collect``, where the event comes soon; None: `episode`."""
-    event_ticks: ClassVar[int] = 50
+    event_duration_ticks: ClassVar[int] = 50
     """Planner ticks that an event takes; figures show these."""
     needs_walking: ClassVar[bool] = False
     """Whether `velocity_command` is not always zero."""

@@ -64,7 +64,7 @@ class BagTask(Task):
     config: BagConfig = BagConfig()
     episode = EpisodeConfig(ticks=125, event_ticks=(10, 40))
     short_episode = EpisodeConfig(ticks=75, event_ticks=(4, 20))
-    event_ticks = 30
+    event_duration_ticks = 30
 
     def __init__(self, config, scenario, robot) -> None:
         super().__init__(config, scenario, robot)

@@ -50,7 +50,7 @@ def test_every_row_of_a_window_is_the_row_of_its_episode(
             t, source = batch["t"][b], episodes[episode]
             valid = batch["valid"][b]
             np.testing.assert_array_equal(np.diff(t[valid]), 1)
-            for name in ("depth", "state", "action", "reward", "success"):
+            for name in ("depth", "state", "action", "reward"):
                 rows = getattr(source, name)[t[valid]]
                 np.testing.assert_array_equal(batch[name][b][valid], rows)
             features = privileged_features(source.object, source.reward_terms)

@@ -73,7 +73,7 @@ class Alarms:
 
 
 class _CheckedRobot:
-    """`LowLevelRobot` of a `LiveRobot`, with 200 checked readings a second."""
+    """As `BridgeRobot`, of a `LiveRobot`, with 200 checked readings a second."""
 
     def __init__(self, robot: LiveRobot, clock: LockstepClock, alarms: Alarms) -> None:
         self._clock, self._alarms = clock, alarms

@@ -14,7 +14,7 @@ from egovcp.rate import NS_PER_S
 from egovcp.sim.live import DAMPED, LiveRobot, ServoCommand
 from egovcp.spec import PHYSICS_DT
 from egovcp_deploy.robots.base import DepthImage, LowState, MotorCommand
-from egovcp_deploy.robots.remote_control import RemoteControl
+from egovcp_deploy.robots.wire import RemoteControl
 
 STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
 
@@ -39,7 +39,7 @@ class SimClock:
 
 
 class SimLowLevelRobot:
-    """`LowLevelRobot` of a `LiveRobot` in an episode; also a robot of `EpisodeSequencer`.
+    """As `BridgeRobot`, of a `LiveRobot` in an episode; also a robot of `EpisodeSequencer`.
 
     Args:
         robot: the simulation.
