@@ -7,6 +7,8 @@
 * ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`), in a process as Python
   starts it: the same weights, batch and random draws, and, before anything is measured, the same
   loss as ``float32``;
+* ``critic``: ``step`` with Q fitted to the critic, which is trained on, the default of
+  ``egovcp-train`` where the data has positions of objects; the others fit Q to returns;
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
@@ -44,14 +46,18 @@ from egovcp.data import (
     open_dataset,
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
+from egovcp.model.privileged_value import PrivilegedValue
+from egovcp.plan import PlannerConfig
 from egovcp_train.config import OptimizerConfig, SamplingConfig
 from egovcp_train.datasets import set_normalisation, to_tensors
 from egovcp_train.device import choose_bf16, keep_freed_memory
 from egovcp_train.loop import Learner
+from egovcp_train.privileged_value import Critic
 
 TOLERANCE = 1e-4  # of the loss, relative: sums of some million fp32 numbers in another order
 LENGTH = SamplingConfig().length
 EPISODES = 100  # of each task
+CRITIC_TRAINED = 0.5  # progress of a run at which the critic is trained as well
 CPU = torch.device("cpu")
 BF16 = choose_bf16("auto", CPU)
 
@@ -92,11 +98,20 @@ class Learners:
     def _ours(self) -> Learner:
         return Learner(copy.deepcopy(self._model), self._config, seed=0, bf16=BF16)
 
+    @cached_property
+    def _with_critic(self) -> Learner:
+        learner = Learner(copy.deepcopy(self._model), self._config, seed=0, bf16=BF16)
+        value = PrivilegedValue(self._batch.privileged.shape[-1])
+        lr = self._config.privileged_value.training_lr
+        learner.critic = Critic(value, PlannerConfig(), lr)
+        return learner
+
     def first(self, side: Side) -> float:
         """The first step warms all up; its loss, in float32."""
         if side == "plain":
             return self._plain.update(self._batch)
         self._ours.update(self._batch, 0.0)
+        self._with_critic.update(self._batch, CRITIC_TRAINED)
         return float(self._float32.update(self._batch, 0.0)["loss/total"])
 
     def turn(self, side: Side) -> Times:
@@ -114,6 +129,7 @@ class Learners:
         cases: dict[str, Callable[[], object]] = {
             "float32": lambda: self._float32.update(self._batch, 0.0),
             "step": lambda: self._ours.update(self._batch, 0.0),
+            "critic": lambda: self._with_critic.update(self._batch, CRITIC_TRAINED),
             "data": on_data,
         }
         return {name: timed(case) for name, case in cases.items()} | {"wait": wait}
@@ -180,6 +196,7 @@ def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
         f"{name}_ratio": ratio("plain", "step"),
         f"{name}_clock_ratio": ratio("plain", "step", of=1),
         f"{name}_float32_ratio": ratio("plain", "float32"),
+        f"{name}_critic_ratio": ratio("critic", "step"),
         f"{name}_data_ratio": ratio("data", "step"),
         f"{name}_wait_share": ratio("wait", "data"),
         f"{name}_steps_per_s": 1.0 / clock,

@@ -49,6 +49,7 @@ def test_trains_and_resumes(theirs: Path, arguments: Arguments, tmp_path: Path) 
     [
         ((), "leave out --features"),
         (("--datasets=[{root: x}]",), "--features is for the --dataset of a new run"),
+        (("--returns.weights={hit: 2.0}",), "one reward, without named terms"),
         (("--features={reward: rewrad}",), "did you mean 'reward'?"),
     ],
 )

@@ -20,6 +20,7 @@ from egovcp.testing import random_batch, toy_model
 from egovcp_train import privileged_value
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import PrivilegedValueConfig
+from egovcp_train.loop import Budget
 from egovcp_train.privileged_value import Critic, Transitions
 from egovcp_train.train import main
 from tests.support.data_parallel import in_two_processes
@@ -56,6 +57,13 @@ def _model(gamma: float = 0.0) -> WorldModel:
     return model
 
 
+def _fit(
+    model: WorldModel, store: EpisodeStore, config: PrivilegedValueConfig, seed: int = 0
+) -> Critic:
+    progress = Budget(config.updates, max_minutes=0.0).progress
+    return privileged_value.fit(model, store, config, _PLANNER, seed, progress)
+
+
 def _changes(value: PrivilegedValue, rows: Transitions, column: int, by: float) -> torch.Tensor:
     """Change of the value of some rows if one action is changed."""
     state, features, action = (x[:50] for x in rows.inputs)
@@ -66,7 +74,7 @@ def _changes(value: PrivilegedValue, rows: Transitions, column: int, by: float) 
 
 def test_without_a_future_it_is_the_reward_of_object_and_action(store: EpisodeStore) -> None:
     store, model = _rewarded(store), _model()
-    value = privileged_value.fit(model, store, _CONFIG, _PLANNER, seed=0).value
+    value = _fit(model, store, _CONFIG).value
     rows = Transitions(model, store)
     reward = value(*rows.inputs).detach()
     assert float((reward - rows.reward).square().mean() / rows.reward.var()) < 0.1
@@ -186,9 +194,18 @@ def test_after_a_failure_nothing_is_expected(store: EpisodeStore, failed: bool) 
     ended = np.full(store.num_frames, failed)
     store = dataclasses.replace(store, reward=ones, terminal_next=ended)
     config = PrivilegedValueConfig(updates=150, rows=32, lr=3e-3)
-    value = privileged_value.fit(_model(0.5), store, config, _PLANNER, seed=0).value
+    value = _fit(_model(0.5), store, config).value
     expected = value(*Transitions(_model(), store).inputs).detach().mean()
     assert float(expected) == pytest.approx(1.0 if failed else 2.0, abs=0.1)
+
+
+def test_the_time_limit_ends_the_fit(store: EpisodeStore) -> None:
+    """Its learning rate has decayed by then."""
+    seconds = iter(range(1000))
+    progress = Budget(1000, 0.1, clock=lambda: float(next(seconds))).progress
+    config = PrivilegedValueConfig(updates=1000, rows=16, lr=1e-2)
+    critic = privileged_value.fit(_model(0.9), store, config, _PLANNER, 0, progress)
+    assert critic.state_dict()["updates"] == 5
 
 
 def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: EpisodeStore) -> None:
@@ -197,8 +214,7 @@ def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: Episode
     expected = torch.rand(3)
     torch.manual_seed(5)
     first, second, other = (
-        privileged_value.fit(model, _rewarded(store), config, _PLANNER, seed).value.state_dict()
-        for seed in (0, 0, 1)
+        _fit(model, _rewarded(store), config, seed).value.state_dict() for seed in (0, 0, 1)
     )
     assert torch.equal(torch.rand(3), expected)
     assert all(torch.equal(first[name], second[name]) for name in first)

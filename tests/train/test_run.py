@@ -419,6 +419,15 @@ def test_command_has_at_most_70_options(capsys: pytest.CaptureFixture[str]) -> N
     assert len(re.findall(r"^ +--", capsys.readouterr().out, re.MULTILINE)) <= 70
 
 
+def test_a_file_may_name_a_preset_and_change_it(tmp_path: Path) -> None:
+    file = tmp_path / "changed.yaml"
+    file.write_text("preset: paper\nsteps: 100\nplanner: {elites: 8}\n", encoding="utf-8")
+    config = _parsed(f"--config_path={file}", "--batch_size=2")
+    assert (config.preset, config.steps, config.batch_size) == ("paper", 100, 2)
+    assert (config.planner.samples, config.planner.elites) == (1024, 8)
+    assert config.policy.loss.q_target == "mc"
+
+
 def _parsed(*flags: str) -> TrainConfig:
     return parse_config(
         TrainConfig, ["--output_dir=x", *flags], "egovcp-train", "", option_defaults

@@ -26,7 +26,8 @@ class PrivilegedValueConfig:
     """Fit of the target of Q, see `egovcp_train.privileged_value`."""
 
     updates: int = bounded(5000, least=1, most=10_000_000)
-    """Updates before the training of the world model."""
+    """Updates before the training of the world model, for which a quarter of --max_minutes is
+    spent at most."""
     rows: int = bounded(512, least=1, most=1_000_000)
     """Rows of an update."""
     lr: float = bounded(1e-3, above=0)
@@ -186,7 +187,7 @@ class TrainConfig:
     resume: bool = False
     """Resume from the last checkpoint in output_dir, with its options unless given."""
     log_freq: int = bounded(50, least=1)
-    """Steps between TensorBoard records."""
+    """Steps between logged training metrics."""
     eval_freq: int = bounded(1000, least=0)
     """Steps between evaluations on held-out episodes; 0: only at the end."""
     eval_closed_loop: int = bounded(0, least=0, most=1_000_000)
@@ -230,8 +231,7 @@ def default() -> TrainConfig:
 
 def laptop() -> TrainConfig:
     """The default, ended by the clock; the recipe of `make quickstart`."""
-    optimizer = OptimizerConfig(privileged_value=PrivilegedValueConfig(updates=3000, rows=256))
-    return replace(default(), preset="laptop", max_minutes=9.5, optimizer=optimizer)
+    return replace(default(), preset="laptop", max_minutes=9.5)
 
 
 def debug() -> TrainConfig:

@@ -119,7 +119,8 @@ def converted(config: TrainConfig, group: ProcessGroup) -> TrainConfig:
     converted the one that has other features; unchanged without ``features``.
 
     Raises:
-        UsageError: --datasets is given too, or the dataset has no such features.
+        UsageError: --datasets or --returns.weights is given too, or the dataset has no such
+            features.
         DataError: it is missing or damaged.
         EnvironmentFailure: the Hub cannot be reached.
     """
@@ -129,6 +130,11 @@ def converted(config: TrainConfig, group: ProcessGroup) -> TrainConfig:
         raise UsageError(
             "--features is for the --dataset of a new run; leave it out with --datasets, which "
             "takes converted ones, and with --resume"
+        )
+    if config.returns.weights:
+        raise UsageError(
+            "--returns.weights: a dataset with --features has one reward, without named terms; "
+            "leave the weights out"
         )
     root = Path(config.output_dir).absolute() / "dataset"
     if group.is_first:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple, Self
 
@@ -285,6 +285,7 @@ def fit(
     config: PrivilegedValueConfig,
     planner: PlannerConfig,
     seed: int,
+    progress: Callable[[int], float],
     bf16: bool = False,
 ) -> Critic:
     """Fit a value to the episodes of ``store``; shows its progress.
@@ -295,6 +296,7 @@ def fit(
         config: number and size of the updates.
         planner: costs of the actions that it plans.
         seed: seed of weights and draws.
+        progress: part of the fit, in [0, 1], that is done after so many updates.
         bf16: compute the values of the next rows with matrix products in bfloat16.
     """
     rows = Transitions(model, store)
@@ -308,17 +310,23 @@ def fit(
     seen.copy_((seen.square() + (_OBJECT_ERROR * model.object_std).square()).sqrt())
     critic = Critic(value, planner, config.lr)
     generator = torch.Generator(device=device).manual_seed(seed)
-    for step in tqdm(range(config.updates), desc="privileged value", mininterval=1.0):
-        critic.set_learning_rate(config.lr * 0.5 * (1 + math.cos(math.pi * step / config.updates)))
-        critic.fit_step(model, rows, config.rows, generator, bf16)
+    with tqdm(total=config.updates, desc="privileged value", mininterval=1.0) as bar:
+        while (done := progress(bar.n)) < 1:
+            critic.set_learning_rate(config.lr * 0.5 * (1 + math.cos(math.pi * done)))
+            critic.fit_step(model, rows, config.rows, generator, bf16)
+            bar.update()
     critic.set_learning_rate(config.training_lr)
     return critic
 
 
 def prepare(
-    model: WorldModel, data: TrainingData, group: ProcessGroup, bf16: bool = False
+    model: WorldModel,
+    data: TrainingData,
+    group: ProcessGroup,
+    progress: Callable[[int], float],
+    bf16: bool = False,
 ) -> Critic | None:
-    """Fit the critic of a run in its first process, and say how well it agrees with returns.
+    """`fit` the critic of a run in its first process, and say how well it agrees with returns.
 
     Returns:
         None if the target of Q is another one, also because the data lacks positions of objects.
@@ -338,6 +346,7 @@ def prepare(
             config.optimizer.privileged_value,
             config.planner,
             config.seed,
+            progress,
             bf16,
         )
         found = correlation(model, data.heldout, critic.value)

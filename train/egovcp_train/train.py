@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -59,8 +58,12 @@ from egovcp_train.publish import publish_trained, reserve_policy, versions, writ
 from egovcp_train.records import Records, TensorBoardRecorder, TrackioRecorder, WandbRecorder
 
 PROG = "egovcp-train"
-EPILOG = "Options not listed here are set by --preset; the file of --config_path can override them."
+EPILOG = (
+    "Other options are set by --preset, or by a file instead: copy train_config.yaml of a run, "
+    "edit it, and give --config_path."
+)
 LAUNCHER_ECHO_S = 5.0
+_FIT_SHARE: Final = 0.25  # part of --max_minutes that the fit of the critic takes at most
 _BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
     f"{PROG}: steps are correct but many times slower than possible on this GPU, because they "
@@ -77,7 +80,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     """The defaults of the options: those of the run that is resumed, or of --preset.
 
     Raises:
-        UsageError: a config file, which has all options, would hide the preset.
+        UsageError: --preset and --config_path are both given.
     """
     if options := resumed_options(TrainConfig, argv):
         return options
@@ -115,9 +118,12 @@ def train(config: TrainConfig) -> None:
     if config.resume:
         spent = _restore(output, learner, data)
     else:
-        start = time.monotonic()
-        learner.critic = privileged_value.prepare(learner.model, data, group, bf16)
-        spent = time.monotonic() - start  # it is part of --max_minutes
+        updates = config.optimizer.privileged_value.updates
+        fitting = Budget(updates, _FIT_SHARE * config.max_minutes)
+        learner.critic = privileged_value.prepare(
+            learner.model, data, group, fitting.progress, bf16
+        )
+        spent = fitting.spent
     provenance = _provenance(data)
     simulation = None
     if group.is_first:
