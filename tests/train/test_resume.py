@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import draccus
@@ -195,7 +194,6 @@ def test_a_resumed_run_has_the_minutes_that_were_left(
     """The fit of the privileged value counts, 30 s here."""
     now = [0.0]
     monkeypatch.setattr("egovcp_train.train.Budget", partial(Budget, clock=lambda: now[0]))
-    monkeypatch.setattr("egovcp_train.train.time", SimpleNamespace(monotonic=lambda: now[0]))
     update, fit = Learner.update, privileged_value.fit
 
     def slow_fit(*args: Any) -> PrivilegedValue:
