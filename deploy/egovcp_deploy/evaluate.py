@@ -190,23 +190,10 @@ def evaluate(config: EvalConfig) -> None:
             if received:
                 raise KeyboardInterrupt
     finally:
-        counts = {
-            f"{task} {name}": len(scores[task][name]) for task in scores for name in scores[task]
-        }
-        if any(counts.values()):
-            played = {
-                task: {
-                    name: sorted(each, key=lambda score: score.episode)
-                    for name, each in row.items()
-                    if each
-                }
-                for task, row in scores.items()
-                if any(row.values())
-            }
-            complete = min(counts.values()) == config.episodes
+        if played := _sorted_scores(scores):
             record = {
                 "backend": backend,
-                "complete": complete,
+                "complete": not _missing(config, scores),
                 "config": encoded(config, "policy.path", "constant.path", "ppo.path", "output_dir"),
                 "artifact": artifact.manifest if artifact else None,
                 "ppo": dict(ppo.provenance) if ppo else None,
@@ -226,14 +213,33 @@ def evaluate(config: EvalConfig) -> None:
             echo(table(figures))
             if backend:
                 echo(f"plans computed by {backend}")
-            if skipped := sum(
-                s.skipped for row in played.values() for e in row.values() for s in e
-            ):
+            every = [score for row in played.values() for each in row.values() for score in each]
+            if skipped := sum(score.skipped for score in every):
                 echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
-            if not complete:
-                missing = [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
+            if missing := _missing(config, scores):
                 echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
             echo(f"figures: {folder / 'eval.json'}")
+
+
+def _sorted_scores(scores: Scores) -> Scores:
+    """The scores in the order of the scenarios, without tasks and controllers without episodes."""
+    rows = {
+        task: {
+            name: sorted(each, key=lambda score: score.episode)
+            for name, each in row.items()
+            if each
+        }
+        for task, row in scores.items()
+    }
+    return {task: row for task, row in rows.items() if row}
+
+
+def _missing(config: EvalConfig, scores: Scores) -> list[str]:
+    """``[ball hold 0 of 80, ...]``: what each controller has played, if episodes are missing."""
+    counts = {f"{task} {name}": len(scores[task][name]) for task in scores for name in scores[task]}
+    if min(counts.values()) == config.episodes:
+        return []
+    return [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
 
 
 def _find_constants(

@@ -1,8 +1,7 @@
 """Value-guided sampling MPC (paper section III-D): sample plans, evaluate them, refine the samples.
 
-Candidates follow the action process of the data, a_k = a_{k-1} + eta * delta_k with delta in
-[-1, 1]^7, from the last executed action: Q is only trained on such actions. A search has no side
-effects and reads no clock but ``remaining``.
+Candidates change by at most eta per step from the last executed action, a_k = a_{k-1} + eta *
+delta_k with delta in [-1, 1]^7. A search has no side effects and reads no clock but ``remaining``.
 """
 
 from __future__ import annotations

@@ -231,7 +231,8 @@ def default() -> TrainConfig:
 
 def laptop() -> TrainConfig:
     """The default, ended by the clock; the recipe of `make quickstart`."""
-    return replace(default(), preset="laptop", max_minutes=9.5)
+    optimizer = OptimizerConfig(privileged_value=PrivilegedValueConfig(updates=3000, rows=256))
+    return replace(default(), preset="laptop", max_minutes=9.5, optimizer=optimizer)
 
 
 def debug() -> TrainConfig:

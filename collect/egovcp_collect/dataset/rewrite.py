@@ -167,7 +167,7 @@ def run_repair(config: RepairConfig) -> None:
         for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
             writer.add(episode)
         if not writer.num_episodes:
-            _report(config, root, output, writer, dropped)
+            _report(config, root, output, writer, dropped)  # raises: nothing is written
     _report(config, root, output, writer, dropped)
 
 
@@ -183,7 +183,7 @@ def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
                 writer.add(found)
         echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
         if not writer.num_episodes:
-            _report(config, root, output, writer, dropped)
+            _report(config, root, output, writer, dropped)  # raises: nothing is written
         writer.finish()
     _report(config, root, output, writer, dropped)
 

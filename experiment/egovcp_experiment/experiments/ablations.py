@@ -44,7 +44,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ]
         for name, flags in config.chosen(CHOICES).items()
     }
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Ablations: what each choice of the world model is worth on held-out episodes",
         parts=[
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
@@ -60,10 +60,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             for name, cells in trainings.items()
             if (row := results.heldout(records, cells, task))
         }
-        report.shows += _conclusions(task, rows)
-        report.parts.append(_table(task, rows))
-        report.figures[task] = rows
-    return report
+        page.shows += _conclusions(task, rows)
+        page.parts.append(_table(task, rows))
+        page.figures[task] = rows
+    return page
 
 
 def _conclusions(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:

@@ -116,7 +116,7 @@ def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     chosen = _chosen(grid.config)
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Generalisation: scenes that no model was trained on",
         parts=[
             "The model knows scenes `as_trained` only. All conditions draw the same scenarios, so "
@@ -126,7 +126,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ],
     )
     if SequenceTask.name in chosen:
-        report.parts.append(
+        page.parts.append(
             "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
             "played by the same model, whose input names neither tasks nor times. Each part draws "
             "what its task draws alone; parts after a fall are failures."
@@ -144,15 +144,15 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
                 references[name] = results.controller_scores(records, cell, task, _REFERENCES)
         base = next(iter(row))
         if base in planner:
-            report.parts.append(_table(task, planner, references, row))
+            page.parts.append(_table(task, planner, references, row))
             plot = results.comparison_plot(f"conditions-{task}", task, planner, base)
-            report.parts.append(plot)
-            report.shows += _conclusions(task, planner)
-        report.figures[task] = {
+            page.parts.append(plot)
+            page.shows += _conclusions(task, planner)
+        page.figures[task] = {
             name: results.figures_of({"planner": scores, **references[name]})
             for name, scores in planner.items()
         }
-    return report
+    return page
 
 
 def _table(

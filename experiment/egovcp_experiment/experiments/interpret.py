@@ -23,7 +23,7 @@ from egovcp_experiment.studies.open_loop import HORIZONS
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Interpretation: values, open-loop predictions, and behaviour with and without events"
     )
     studies = {
@@ -39,28 +39,28 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             if cell in records:
                 found = records[cell]["figures"]
                 drawn_only = ("maps", "strips", "x", "z")
-                report.figures[cell] = {k: v for k, v in found.items() if k not in drawn_only}
-                add(report, task, found)
-    return report
+                page.figures[cell] = {k: v for k, v in found.items() if k not in drawn_only}
+                add(page, task, found)
+    return page
 
 
-def _add_value_maps(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
+def _add_value_maps(page: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     summary = found["summary"]
     rows = [
         (name, str(row["episodes"]), f"{row['spread']:.3f}", f"{100 * row['height_error_m']:.1f}")
         for name, row in summary.items()
     ]
     head = ("flight", "episodes", "best - worst (deviations of the return)", "height error (cm)")
-    report.parts += [
+    page.parts += [
         "Q of the planned action with the target of that hand moved over its x-z plane, all else "
         "equal. Height error: between the best point of the map and the height of the ball's aim.",
         Table("Value map of the hand on the ball's side, means over episodes", head, rows),
     ]
     if found["maps"]:
-        report.parts.append(_map_plot(found))
+        page.parts.append(_map_plot(found))
     if {"before", "75%"} <= summary.keys():
         before, late = summary["before"], summary["75%"]
-        report.shows.append(
+        page.shows.append(
             f"{task}: the value map of a hand spans {before['spread']:.2f} deviations "
             f"of the return before the throw and {late['spread']:.2f} at 75 % of the flight; the "
             f"best point is {100 * before['height_error_m']:.0f} and "
@@ -100,7 +100,7 @@ def _map_plot(found: Mapping[str, Any]) -> Plot:
     )
 
 
-def _add_open_loop(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
+def _add_open_loop(page: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     errors = found["errors_m"]
     last = errors[str(HORIZONS[-1])]
     head = ("ticks ahead", "model (cm)", "repeat (cm)", "moving: model (cm)", "moving: repeat (cm)")
@@ -109,15 +109,15 @@ def _add_open_loop(report: ExperimentReport, task: str, found: Mapping[str, Any]
     )
     columns = ("model", "repeat", "model_moving", "repeat_moving")
     rows = [(k, *(_centimetres(row[c]) for c in columns)) for k, row in errors.items()]
-    report.parts.append(Table(title, head, rows))
+    page.parts.append(Table(title, head, rows))
     if last["model_moving"] is not None:
-        report.shows.append(
+        page.shows.append(
             f"{task}: {HORIZONS[-1]} ticks ahead, the error on moving pixels is "
             f"{100 * last['model_moving']:.0f} cm, that of repeating the last image "
             f"{100 * last['repeat_moving']:.0f} cm"
         )
     if found["strips"]:
-        report.parts.append(_strip_plot(task, found["strips"]))
+        page.parts.append(_strip_plot(task, found["strips"]))
 
 
 def _centimetres(metres: float | None) -> str:
@@ -155,7 +155,7 @@ _BEHAVIOUR: Final = {
 }
 
 
-def _add_behaviour(report: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
+def _add_behaviour(page: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
     rows = []
     for key, name in _BEHAVIOUR.items():
         if key in found:
@@ -168,8 +168,8 @@ def _add_behaviour(report: ExperimentReport, task: str, found: Mapping[str, Any]
                 low, high = row["ci95"]
                 shown = (f"{100 * row['mean']:.1f}", f"{100 * low:.1f} to {100 * high:.1f}")
             rows.append((name, *shown, str(row["episodes"])))
-    report.parts.append(Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), rows))
-    report.shows += _behaviour_conclusion(task, found)
+    page.parts.append(Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), rows))
+    page.shows += _behaviour_conclusion(task, found)
 
 
 def _behaviour_conclusion(task: str, found: Mapping[str, Any]) -> list[str]:

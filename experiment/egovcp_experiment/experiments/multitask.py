@@ -18,7 +18,7 @@ _LATENT_EPISODES: Final = 16  # per task
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Multi-task: one model on mixed data against one for each task",
         parts=[_introduction(config)],
     )
@@ -32,27 +32,27 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         scores = results.all_scores(records, plays, task)
         cell = grid.references(task)
         references = results.controller_scores(records, cell, task, REFERENCES)
-        report.figures[task] = results.figures_of({**scores, **references})
+        page.figures[task] = results.figures_of({**scores, **references})
         if scores:
             tables.append(results.comparison(task, {**scores, **references}, "single"))
         if len(scores) == 2:
-            report.shows.append(_conclusion(task, scores))
+            page.shows.append(_conclusion(task, scores))
         if {"oracle", "random"} <= references.keys():
             levels[task] = {name: _level(each, references) for name, each in scores.items()}
-            report.figures[task]["normalised"] = levels[task]
+            page.figures[task]["normalised"] = levels[task]
     if levels:
-        report.parts.append(_levels_plot(levels))
-    report.parts += tables
+        page.parts.append(_levels_plot(levels))
+    page.parts += tables
     episodes = min(config.play.episodes, _LATENT_EPISODES)
     cell = grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
     if cell in records:
         latents = records[cell]["figures"]
-        report.parts.append(_maps(latents))
-        report.shows.append(_separation(latents))
-        report.figures["latents"] = {
+        page.parts.append(_maps(latents))
+        page.shows.append(_separation(latents))
+        page.figures["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }
-    return report
+    return page
 
 
 def _introduction(config: ExperimentConfig) -> str:

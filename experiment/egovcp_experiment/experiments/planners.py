@@ -25,7 +25,7 @@ RULES: Final[dict[str, Flags]] = {
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Planners: searches in equal time, and rules after a failure",
         parts=[
             "Searches: each has the largest number of candidates with a plan time below "
@@ -45,18 +45,18 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         rules = results.all_scores(records, rule_plays, task)
         timing = records.get(f"plan_time-{task}")
         if timing is not None:
-            report.parts.append(_timings(task, timing["figures"]["searches"], searches))
+            page.parts.append(_timings(task, timing["figures"]["searches"], searches))
         for kind, scores, reference in (("searches", searches, "cem"), ("rules", rules, "default")):
             if scores:
                 title = f"{task}: {kind}"
-                report.parts += [
+                page.parts += [
                     results.comparison(title, scores, reference),
                     results.comparison_plot(f"{task}-{kind}", title, scores, reference),
                 ]
-                report.shows += _conclusions(task, kind, scores, reference)
+                page.shows += _conclusions(task, kind, scores, reference)
         named = {f"search_{name}": each for name, each in searches.items()}
-        report.figures[task] = results.figures_of({**named, **rules})
-    return report
+        page.figures[task] = results.figures_of({**named, **rules})
+    return page
 
 
 def _search_plays(grid: Grid, task: str, searches: Sequence[str]) -> dict[str, list[str]]:

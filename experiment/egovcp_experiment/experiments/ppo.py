@@ -66,7 +66,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     if not config.ppo.steps:
         raise UsageError("--ppo.steps=0 leaves PPO out; expected at least 1 here")
-    report = ExperimentReport(
+    page = ExperimentReport(
         "PPO, without a model, next to the planner",
         parts=[
             f"PPO was trained in the simulator for {config.ppo.transitions[-1]} transitions of "
@@ -88,13 +88,13 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             if planner is not None:
                 curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
             caption = f"{task}: success and reward against transitions"
-            report.parts.append(results.learning_curves(task, caption, curves))
-            report.shows += _conclusions(task, offline, planner, ppo, bounds)
-            report.figures[task] = {"planner_transitions": offline}
+            page.parts.append(results.learning_curves(task, caption, curves))
+            page.shows += _conclusions(task, offline, planner, ppo, bounds)
+            page.figures[task] = {"planner_transitions": offline}
         if shown:
-            report.parts.append(results.comparison(task, shown, _PLANNER))
-            report.figures.setdefault(task, {}).update(results.figures_of(shown))
-    return report
+            page.parts.append(results.comparison(task, shown, _PLANNER))
+            page.figures.setdefault(task, {}).update(results.figures_of(shown))
+    return page
 
 
 def _conclusions(

@@ -17,7 +17,7 @@ from egovcp_experiment.report import ExperimentReport, Part
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     grid.collected = max(1.0, *config.data.parts)
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
         parts=[
             f"Every model was trained for {config.train.budget} on the first episodes of one "
@@ -50,14 +50,14 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             **results.controller_scores(records, bounds, task, BOUNDS),
         }
         tables.append(results.comparison(task, shown, list(named)[-1]))
-        report.shows.append(_conclusion(task, named))
-        report.figures[task] = results.figures_of(shown)
+        page.shows.append(_conclusion(task, named))
+        page.figures[task] = results.figures_of(shown)
     if curves:
         caption = "Success and reward against transitions"
         plot = results.learning_curves("transitions", caption, curves + ppo_curves)
-        report.parts.append(plot)
-    report.parts += tables
-    return report
+        page.parts.append(plot)
+    page.parts += tables
+    return page
 
 
 def _model(grid: Grid, task: str, part: float) -> Model:

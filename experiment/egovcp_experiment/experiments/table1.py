@@ -167,31 +167,31 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         for task in claim.tasks
         if (verdict := judge(claim, task, plays.get(task, {}), records)) is not None
     ]
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Table I: horizons, autoregressive training and other objectives",
         _conclusions(verdicts, scores),
         [_introduction(config)],
         {"claims": [v.figures() for v in verdicts]},
     )
     if scores:
-        report.parts.append(_summary(scores))
+        page.parts.append(_summary(scores))
     if verdicts:
         head = (
             *("the paper's claim", "task", "here", "success (points)", "95 %", "reward/step"),
             *("95 %", "trainings", "the paper's reward"),
         )
         title = "Differences, above - below, on the same scenarios"
-        report.parts.append(Table(title, head, [verdict.row() for verdict in verdicts]))
+        page.parts.append(Table(title, head, [verdict.row() for verdict in verdicts]))
     for task in config.tasks:
         cell = grid.bounds(task)
         if task in scores:
             bounds = results.controller_scores(records, cell, task, BOUNDS)
             titled = {ROWS[name].title: each for name, each in scores[task].items()}
             ours = ROWS[OURS].title
-            report.parts.append(results.comparison(task, {**titled, **bounds}, ours))
-            report.parts.append(results.comparison_plot(task, task, titled, ours))
-            report.figures[task] = results.figures_of({**scores[task], **bounds})
-    return report
+            page.parts.append(results.comparison(task, {**titled, **bounds}, ours))
+            page.parts.append(results.comparison_plot(task, task, titled, ours))
+            page.figures[task] = results.figures_of({**scores[task], **bounds})
+    return page
 
 
 def judge(

@@ -22,7 +22,7 @@ _PLANS: Final = {"planner": "plans that the planner chose", "random": "random pl
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     walk = [flag for flag in config.data.flags if flag.partition("=")[0] in _WALK]
-    report = ExperimentReport(
+    page = ExperimentReport(
         "Variance: do the errors of Q along a plan average out?",
         parts=[
             "Residuals are Q along an imagined plan minus the mean return of random walks that the "
@@ -37,19 +37,19 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         cell = grid.sim_study("residuals", task, flags, walk)
         plays = {n: grid.plays(task, f"horizon_{n}", {"planner.horizon": n}) for n in _HORIZONS}
         scores = results.all_scores(records, plays, task)
-        report.figures[task] = {"horizons": results.figures_of(scores)}
+        page.figures[task] = {"horizons": results.figures_of(scores)}
         if cell in records:
             plans = records[cell]["figures"]["plans"]
-            report.figures[task]["residuals"] = plans
+            page.figures[task]["residuals"] = plans
             known = {kind: row for kind, row in plans.items() if "horizons" in row}
-            report.parts += [_table(task, kind, row) for kind, row in known.items()]
+            page.parts += [_table(task, kind, row) for kind, row in known.items()]
             if known and scores:
-                report.parts.append(_plot(task, known, scores))
-            report.shows += _conclusions(task, known, scores)
+                page.parts.append(_plot(task, known, scores))
+            page.shows += _conclusions(task, known, scores)
         if scores:
             rows = {f"N = {n}": each for n, each in scores.items()}
-            report.parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
-    return report
+            page.parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
+    return page
 
 
 def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:

@@ -27,7 +27,7 @@ from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_deploy.options import SEEDS, held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS
+from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
@@ -116,14 +116,8 @@ def serve(
             while not (episodes.finished or interrupts):
                 for _ in range(pacer.wait_for_steps()):
                     episodes.step()
-                while not lines.empty():
-                    line = lines.get()
-                    if line == "quit":
-                        return
-                    try:
-                        _print(bridge.faults.apply(line))
-                    except UsageError as error:
-                        _print(str(error))
+                if not _apply_lines(lines, bridge.faults):
+                    return
                 if bridge.faults.crash:
                     os._exit(1)
                 if config.json and len(episodes.outcomes) > written:
@@ -134,6 +128,19 @@ def serve(
             if outcomes := episodes.outcomes:
                 successes = sum(outcome.success for outcome in outcomes)
                 _print(f"{len(outcomes)} episodes, {successes} successes")
+
+
+def _apply_lines(lines: queue.SimpleQueue[str], faults: InjectedFaults) -> bool:
+    """Apply the commands that were typed; false after `quit`."""
+    while not lines.empty():
+        line = lines.get()
+        if line == "quit":
+            return False
+        try:
+            _print(faults.apply(line))
+        except UsageError as error:
+            _print(str(error))
+    return True
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:
