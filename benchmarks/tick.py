@@ -14,10 +14,9 @@ checks make a control tick at most 5 % longer. The cases of a part take turns of
 from __future__ import annotations
 
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
@@ -32,19 +31,18 @@ from egovcp.plan import PlannerConfig, Policy, PolicyStep
 from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import ACTION_DIM, CONTROLLER_HZ, PLANNER_HZ, STATE_DIM, STATE_SLICES
-from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.live.control_process import CONTROL, RECEIVING, raise_priority
-from egovcp_deploy.live.hardware import Hardware, open_hardware
-from egovcp_deploy.live.processes import simulated_robot
+from egovcp_deploy.live.hardware import CameraOptions, Hardware, open_hardware
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from tests.support.lockstep import LockstepClock
-from tests.support.robots.fake_g1 import raised_priority
+from tests.support.robots.fake_g1 import bridge_config, fake_g1_process, raised_priority
 
 _CONTROLLER = "stance"
 _SETTLE_TICKS = 10  # after a switch between the two cases
@@ -108,25 +106,20 @@ def _loop(hardware: Hardware, checked: bool) -> ControlLoop:
 
 def control_figures(rounds: int) -> dict[str, object]:
     """Percentiles of ``rounds`` seconds of each case, which take turns of a second."""
-    config = DeployConfig(task="ball")
     late: dict[str, list[float]] = {"checked": [], "unchecked": []}
     interval: dict[str, list[float]] = {"checked": [], "unchecked": []}
     sys.setswitchinterval(0.001)  # as the control process does
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         with raised_priority(RECEIVING):  # for the simulated robot, too
-            hardware = open_hardware(
-                *stack.enter_context(simulated_robot(config, folder / "outcomes.json"))
-            )
+            fake = stack.enter_context(fake_g1_process("--task=ball", "--pause=1e9"))
+            camera = CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
+            hardware = stack.enter_context(closing(open_hardware(bridge_config(fake), camera)))
         granted = raise_priority(CONTROL)
-        try:
-            for turn in range(2 * rounds):
-                checked = turn % 2 == 0
-                name = "checked" if checked else "unchecked"
-                hardware.body._filter = PlausibilityFilter() if checked else _Unchecked()
-                _measure(_loop(hardware, checked), late[name], interval[name])
-        finally:
-            hardware.close()
+        for turn in range(2 * rounds):
+            checked = turn % 2 == 0
+            name = "checked" if checked else "unchecked"
+            hardware.body._filter = PlausibilityFilter() if checked else _Unchecked()
+            _measure(_loop(hardware, checked), late[name], interval[name])
     figures: dict[str, object] = {"control_real_time_priority": granted}
     for what, values in (("control_tick", late), ("control_interval", interval)):
         for name, times in values.items():

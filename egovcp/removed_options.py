@@ -69,6 +69,10 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     "env.arch.motion": (
         "the robot always walks to the arch: leave it out, and use a controller that walks"
     ),
+    "realtime": (
+        "the simulator waits for the planner: leave it out, or start egovcp-fake-g1 and use "
+        "--robot.type=unitree_g1 for a run on the wall clock"
+    ),
     "return_steps": "Q is compared with the returns that it was trained on: leave it out",
 }
 _INDEX: Final = re.compile(r"\[\d+\]")

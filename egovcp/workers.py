@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import time
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -31,7 +30,6 @@ def inherited_by_workers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_signal(
-    echo_s: float = 0.0,
     signals: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM),
     interrupt: bool = True,
 ) -> Iterator[list[int]]:
@@ -41,21 +39,15 @@ def stop_on_signal(
     KeyboardInterrupt.
 
     Args:
-        echo_s: seconds after the first signal in which further signals are ignored: a launcher
-            forwards the Ctrl-C that the terminal has already sent to its processes.
         signals: which signals.
         interrupt: whether a second signal raises KeyboardInterrupt; else it is added to the list.
     """
     received: list[int] = []
-    ignored_until = 0.0
 
     def note(number: int, frame: object) -> None:
-        nonlocal ignored_until
-        if not received or not interrupt:
-            received.append(number)
-            ignored_until = time.monotonic() + echo_s
-        elif time.monotonic() >= ignored_until:
+        if received and interrupt:
             raise KeyboardInterrupt
+        received.append(number)
 
     previous = {s: signal.signal(s, note) for s in signals}
     try:

@@ -17,7 +17,7 @@ from egovcp.sim.tasks.registry import ALL_TASKS, task_names
 from egovcp.values import differences
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 
-_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy")
+_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy")  # which determine the data
 _SHOWN_DIFFERENCES: Final = 5
 
 
@@ -28,7 +28,10 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
         controller_id=controller_id_of(config.env, config.tasks),
         seed=config.seed,
         command=command,
-        versions=installed_versions(),
+        versions={
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in _PACKAGES},
+        },
         config={
             **{name: settings[name] for name in EPISODE_OPTIONS},
             "task": ",".join(config.tasks),  # what `all` means depends on what is installed
@@ -37,13 +40,7 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
     )
 
 
-def installed_versions() -> dict[str, str]:
-    """Installed version of each package that determines the data, and of Python."""
-    packages = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    return {"python": platform.python_version(), **packages}
-
-
-def migrate_config(recorded: Mapping[str, Any]) -> dict[str, Any]:
+def _migrated(recorded: Mapping[str, Any]) -> dict[str, Any]:
     """Recorded `EPISODE_OPTIONS`, with options that are newer than the record filled in, and
     without those of tasks that are neither used nor installed."""
     defaults = draccus.encode(CollectConfig())
@@ -73,7 +70,7 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
-        **dict(differences(migrate_config(before.config), migrate_config(now.config), "--")),
+        **dict(differences(_migrated(before.config), _migrated(now.config), "--")),
         **dict(differences(versions, now.versions, "version of ")),
     }
     changed = {
@@ -97,6 +94,6 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
 
 def _unused_prefixes(*collections: Provenance) -> tuple[str, ...]:
     """Prefixes of the options of tasks that none of the collections has."""
-    used = {task for c in collections for task in migrate_config(c.config)["task"].split(",")}
+    used = {task for c in collections for task in _migrated(c.config)["task"].split(",")}
     unused = [task for task in task_names() if task not in used]
     return tuple(f"--env.{task}{end}" for task in unused for end in (".", "_episode."))

@@ -22,9 +22,9 @@ class RobotOptions:
     """The robot."""
 
     type: Literal["sim", "unitree_g1", "replay"] = "sim"
-    """sim: the simulated G1, in lock-step with the planner, or with --realtime on the wall clock.
-    unitree_g1: a G1, or egovcp-fake-g1, behind LeRobot's bridge, on the wall clock. replay:
-    recorded observations; the policy plans again, and nothing is driven."""
+    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
+    behind LeRobot's bridge, on the wall clock. replay: recorded observations; the policy plans
+    again, and nothing is driven."""
     recordings: str = ""
     """For replay: an MCAP file, or a folder of them."""
     controller: str = "walk"
@@ -68,9 +68,7 @@ class DeployConfig:
     robot: RobotOptions = field(default_factory=RobotOptions)
     """The robot."""
     operator: OperatorOptions = field(default_factory=OperatorOptions)
-    """The operator on the wall clock."""
-    realtime: bool = False
-    """Run the simulated robot on the wall clock, with the messages of a real one."""
+    """The operator of a unitree_g1."""
     dry_run: bool = False
     """Only check what a run of a unitree_g1 needs, and print go or no-go per check; nothing
     moves."""

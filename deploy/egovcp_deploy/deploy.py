@@ -43,10 +43,10 @@ def deploy(config: DeployConfig) -> None:
         return
     planned = config.controller == PLANNER
     artifact = load_policy(config.policy, config.planner) if planned else None
-    if config.robot.type == "sim" and not config.realtime:
+    if config.robot.type == "sim":
         show_viewer(play_rollouts(config, artifact) / "rollout-0.rrd")
         return
-    assert artifact is not None, "checked: only lock-step simulation runs without the planner"
+    assert artifact is not None, "checked: only the simulator runs without the planner"
     if config.robot.type == "replay":
         show_viewer(replay(config, artifact) / "rollout-0.rrd")
     else:
@@ -64,27 +64,18 @@ def check_options(config: DeployConfig) -> None:
     robot = config.robot.type
     if config.controller == PLANNER:
         config.policy.require("choose a reference that needs none, such as --controller=oracle")
-    elif robot != "sim" or config.realtime:
+    elif robot != "sim":
         raise UsageError(
-            f"--controller={config.controller} needs the simulator in lock-step; on the wall clock "
-            "and in a replay only the planner can be used"
+            f"--controller={config.controller} needs --robot.type=sim; only the planner can be "
+            f"used with --robot.type={robot}"
         )
     if config.dry_run and robot != "unitree_g1":
         raise UsageError(f"--dry_run checks a robot; expected --robot.type=unitree_g1, not {robot}")
-    if config.realtime and robot != "sim":
-        raise UsageError(
-            f"--realtime is an option of --robot.type=sim; leave it out with --robot.type={robot}"
-        )
     if robot == "replay" and not config.robot.recordings:
         raise UsageError("--robot.recordings is missing; name an MCAP file, or a folder of them")
     if robot == "sim":
         require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
-        kind = find_task(config.task, "--task")
-        if config.realtime and not kind.robot_spec().is_g1:
-            raise UsageError(
-                f"--realtime drives the G1, and the task {config.task} is of robot "
-                f"{kind.robot_spec().robot_type}; leave it out"
-            )
+        find_task(config.task, "--task")
     if config.robot.camera.type == "realsense":
         require_realsense()
     check_output_dir(config.output_dir)

@@ -59,7 +59,6 @@ CASES = {
         ("dataset.root", "others"),
         ("output_dir", "json"),
     ),
-    "egovcp-dataset audit": ("DATA", ("dataset.root",), ("json",)),
     "egovcp-dataset coverage": ("DATA", ("dataset.root",), ("output_dir", "json")),
     "egovcp-dataset card": ("DATA --output=NEW", ("dataset.root",), ("output", "assets")),
     "egovcp-dataset viz": ("DATA --output=NEW", ("dataset.root",), ("output",)),

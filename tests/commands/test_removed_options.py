@@ -33,6 +33,7 @@ def test_no_option_of_a_command_is_listed_as_removed() -> None:
         ("egovcp-eval-model", "--return_steps=16", "leave it out"),
         ("egovcp-collect", "--backend=ray", "leave it out"),
         ("egovcp-export", "--format=float16", "half precision only"),
+        ("egovcp-deploy", "--realtime=true", "egovcp-fake-g1"),
     ],
 )
 def test_command_refuses_a_removed_option_in_one_line(

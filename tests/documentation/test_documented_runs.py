@@ -43,9 +43,7 @@ _EPISODES = re.compile(r"(episodes[=:] ?\"?0:)\d+")
 #: Run elsewhere, or too long: part of a command line -> where it is tested.
 _ELSEWHERE = {
     "--robot.type=unitree_g1": "tests/deploy/robots/test_fake_command.py",
-    "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",
-    "egovcp-dataset audit": "tests/collect/dataset/test_audit.py",
     "--mapping": "tests/deploy/mcap/test_topics.py",
     "egovcp-task": "tests/deploy/test_task.py",
     "--task=bag": "tests/test_examples.py",

@@ -18,7 +18,6 @@ COMMANDS: Final = CommandGroup(
             ("delete", "edit:run_delete", "write it without some episodes to a new folder", ""),
             ("split", "edit:run_split", "split it at random into several datasets", ""),
             ("merge", "rewrite:run_merge", "join datasets of the same controller", "others"),
-            ("audit", "audit:run_audit", "simulate episodes again; compare them bit for bit", ""),
             ("coverage", "coverage:run_coverage", "report events, returns, actions; assess it", ""),
             ("card", "card:run_card", "write its dataset card, README.md, with plots", ""),
             ("viz", "viz:run_viz", "show an episode in Rerun, or write it as MCAP", ""),

@@ -1,12 +1,10 @@
-"""`egovcp-deploy` on the wall clock: a G1 behind LeRobot's bridge, or a simulated one."""
+"""`egovcp-deploy` on the wall clock: a G1, or `egovcp-fake-g1`, behind LeRobot's bridge."""
 
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +22,7 @@ from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import ControlSetup
 from egovcp_deploy.live.operators import open_operator
 from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
-from egovcp_deploy.live.processes import running_control, simulated_robot, stop_control
+from egovcp_deploy.live.processes import running_control, stop_control
 from egovcp_deploy.options import make_output_dir
 from egovcp_deploy.pilot.planner import PlannerRunner, backend_of
 from egovcp_deploy.recording import (
@@ -36,34 +34,15 @@ from egovcp_deploy.recording import (
     run_info,
 )
 
-SIMULATED_S: Final = 15.0  # in RUN: release from the gantry, settling, the episode
-
 
 def drive(config: DeployConfig, artifact: Artifact) -> None:
-    """One run of a robot, or one episode of the simulated one, recorded as rollout 0; raises as
-    `deploy`."""
-    simulated = config.robot.type == "sim"
-    if simulated:
-        operator = config.operator
-        if operator.type == "auto" and not operator.duration:
-            operator = replace(operator, duration=SIMULATED_S)
-        robot = replace(config.robot, controller=config.env.controller)
-        config = replace(config, robot=robot, operator=operator)
+    """One run of a robot, recorded as rollout 0; raises as `deploy`."""
     robot = config.robot
-    artifact.require_controller(make_controller(robot.controller).id)
+    setup = ControlSetup(robot.bridge, robot.camera, robot.controller, robot.limits)
+    controller_id = make_controller(robot.controller).id
+    artifact.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
-    with ExitStack() as stack:
-        bridge, camera = robot.bridge, robot.camera
-        if simulated:
-            bridge, camera = stack.enter_context(simulated_robot(config, folder / "task.json"))
-        setup = ControlSetup(bridge, camera, robot.controller, robot.limits)
-        _run(config, artifact, folder, setup)
-
-
-def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: ControlSetup) -> None:
-    """Drive, report, raise what ended the run early."""
-    stands = config.robot.type != "sim"
-    stays = stands and not (config.operator.type == "auto" and config.operator.duration)
+    stays = not (config.operator.type == "auto" and config.operator.duration)
     if "OMP_NUM_THREADS" not in os.environ:
         # The control process and the logs need a core: planning threads that wait for one that was
         # preempted are slower than fewer threads.
@@ -71,7 +50,6 @@ def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: ControlS
     policy = artifact.make_policy(1, config.seed)
     runner = PlannerRunner(policy, config.imagine)
     runner.warm_up()
-    controller_id = make_controller(config.robot.controller).id
     info = run_info(config, controller_id, artifact, backend_of(policy))
     try:
         with (
@@ -82,9 +60,7 @@ def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: ControlS
             running_control(setup) as control,
         ):
             process, watchdog, clock = control.process, control.watchdog, MonotonicClock()
-            loop = PlannerLoop(
-                runner, control.link, operator, sink, clock, process.is_alive, stays, stands
-            )
+            loop = PlannerLoop(runner, control.link, operator, sink, clock, process.is_alive, stays)
             watchdog.expected = lambda: loop.quitting
             summary = loop.run(lambda tick: _show(bar, tick))
             stop_control(process, loop)
@@ -99,7 +75,7 @@ def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: ControlS
             path.unlink()
         raise
     report = {
-        "robot": config.robot.type,
+        "robot": robot.type,
         "ticks": summary.ticks,
         "ticks_running": summary.running,
         "ticks_held": summary.held,

@@ -65,8 +65,6 @@ class PlannerLoop:
         control_alive: whether the control process runs.
         stays: whether a robot held after Ctrl-C stands until the second Ctrl-C, as a real one must
             that is not on its gantry yet.
-        stands: whether a robot whose planner has failed stands until the operator ends the run;
-            else the run ends once the hands are in the neutral pose.
         warn: prints an urgent message to the operator.
     """
 
@@ -79,12 +77,11 @@ class PlannerLoop:
         clock: Clock,
         control_alive: Callable[[], bool],
         stays: bool = False,
-        stands: bool = True,
         warn: Callable[[str], None] = warn_on_stderr,
     ) -> None:
         self._runner, self._link, self._operator = runner, link, operator
         self._sink, self._clock, self._control_alive = sink, clock, control_alive
-        self._stays, self._stands, self._warn = stays, stands, warn
+        self._stays, self._warn = stays, warn
         self.summary = LiveSummary()
         self.interrupts: list[int] = []  # SIGINT as often as received
         self.quitting = False  # whether the control process has been sent a quit command
@@ -219,15 +216,14 @@ class PlannerLoop:
             self._send(OperatorCommand(OperatorRequest.HOLD))
             message = f"the planner failed: {describe_failure(error)}"
             self._events.append(message)
-            if not self._stands:
-                self._held_ns = self._clock.now_ns()
-            stands = "the robot is held until the operator ends the run: Ctrl-C twice damps it"
             with suppress(Exception):  # the terminal may be what failed
-                self._warn(f"{message}; {stands if self._stands else 'the run ends'}")
+                self._warn(
+                    f"{message}; the robot is held until the operator ends the run: Ctrl-C twice "
+                    "damps it"
+                )
 
     # --- operator commands ---------------------------------------------------------------
     def _handle_commands(self, now_ns: int) -> None:
-        interrupts = len(self.interrupts)
         commands: Sequence[OperatorCommand] = ()
         try:
             commands = self._operator.commands(now_ns, self._mode)
@@ -236,8 +232,8 @@ class PlannerLoop:
                 raise  # else the operator's failure is not the first one, which is reported
         for command in commands:
             self._send(command, "by the operator")
-        for command in self._interrupt_commands(interrupts, now_ns):
-            self._send(command, "interrupted" if interrupts else "the planner failed")
+        for command in self._interrupt_commands(len(self.interrupts), now_ns):
+            self._send(command, "interrupted")
         if self._damped_ns is not None and now_ns - self._damped_ns > _AFTER_DAMP_S * _NS:
             self._send(OperatorCommand(quit=True), "the motors are damped")
         if self.summary.failure is not None and self._mode in ("", State.INIT):
@@ -245,13 +241,15 @@ class PlannerLoop:
 
     def _interrupt_commands(self, interrupts: int, now_ns: int) -> list[OperatorCommand]:
         """First Ctrl-C: hold, ease the hands, and end the run where that is safe. Second: damp."""
+        if not interrupts:
+            return []
         if interrupts >= 2:
             estop = OperatorCommand(OperatorRequest.ESTOP)
             return [estop] if self._damped_ns is None else []
-        if interrupts == 1 and self._held_ns is None:
+        if self._held_ns is None:
             self._held_ns = now_ns
             return [OperatorCommand(OperatorRequest.HOLD)]
-        if self._held_ns is None or now_ns - self._held_ns <= EASE_S * _NS:
+        if now_ns - self._held_ns <= EASE_S * _NS:
             return []
         return [OperatorCommand(OperatorRequest.HOLD, quit=not self._stays)]
 

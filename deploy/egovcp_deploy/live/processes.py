@@ -1,58 +1,33 @@
-"""Child processes of a run on the wall clock: the control process with its watchdog, and the
-simulated robot. All of them have ended when their context is left."""
+"""The control process of a run on the wall clock, with its watchdog."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import replace
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.async_sink import warn_on_stderr
-from egovcp.parent_death import die_with_parent
 from egovcp.workers import inherited_by_workers
-from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.control_process import control_process, damp_motors
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
+from egovcp_deploy.live.hardware import ControlSetup
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
-from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 
 if TYPE_CHECKING:
     from egovcp_deploy.live.planner_loop import PlannerLoop
-    from egovcp_deploy.robots.fake.command import FakeG1Config
 
 _END_S: Final = 5.0  # for a process to end by itself
 _WATCHDOG_ROUNDS: Final = 20  # of damping commands, 50 ms each
-_SIMULATOR_START_S: Final = 60.0
-_ENDLESS_S: Final = 1e9
 
 
-@contextmanager
-def child_process(target: Callable[..., None], *args: Any, name: str) -> Iterator[BaseProcess]:
-    """A spawned process that ignores Ctrl-C; terminated, then killed, when the context is left."""
-    process = multiprocessing.get_context("spawn").Process(target=target, args=args, name=name)
-    with inherited_by_workers():
-        process.start()
-    try:
-        yield process
-    finally:
-        for end in (process.terminate, process.kill):
-            if process.is_alive():
-                end()
-                process.join(_END_S)
-
-
-# --- the control process ---------------------------------------------------------------------
 class RunningControl(NamedTuple):
     """The control process of one run."""
 
@@ -79,13 +54,30 @@ def running_control(setup: ControlSetup) -> Iterator[RunningControl]:
         with (
             closing(Link(address, serve=True)) as link,
             standby_body(setup.bridge) as body,
-            child_process(control_process, setup, name="egovcp-control") as process,
+            _started(setup) as process,
         ):
             watchdog = DampingWatchdog(process, body)
             try:
                 yield RunningControl(process, link, watchdog)
             finally:
                 watchdog.join_if_ended()
+
+
+@contextmanager
+def _started(setup: ControlSetup) -> Iterator[BaseProcess]:
+    """The process; terminated, then killed, when the context is left."""
+    process = multiprocessing.get_context("spawn").Process(
+        target=control_process, args=(setup,), name="egovcp-control"
+    )
+    with inherited_by_workers():
+        process.start()
+    try:
+        yield process
+    finally:
+        for end in (process.terminate, process.kill):
+            if process.is_alive():
+                end()
+                process.join(_END_S)
 
 
 def stop_control(process: BaseProcess, planner: PlannerLoop) -> None:
@@ -141,46 +133,3 @@ class DampingWatchdog:
         """If the process has ended, wait until the robot is damped, where that is necessary."""
         if not self._process.is_alive():
             self._thread.join()
-
-
-# --- the simulated robot ---------------------------------------------------------------------
-@contextmanager
-def simulated_robot(
-    config: DeployConfig, outcomes: Path
-) -> Iterator[tuple[BridgeConfig, CameraOptions]]:
-    """The simulator on the wall clock behind the wire of a robot, on free ports of the loopback;
-    ``outcomes`` is the file for the result of the episode. Raises `EnvironmentFailure` if the
-    simulator is not installed, or does not start."""
-    from egovcp_deploy.robots.fake.bridge import Ports
-    from egovcp_deploy.robots.fake.command import FakeG1Config
-
-    fake = FakeG1Config(
-        task=config.task,
-        seed=config.seed,
-        pause=_ENDLESS_S,  # one episode
-        ports=Ports(command_port=0, state_port=0, camera_port=0),
-        json=str(outcomes),
-        env=config.env,
-    )
-    ours, theirs = multiprocessing.get_context("spawn").Pipe(duplex=False)
-    with child_process(_simulate, fake, theirs, os.getpid(), name="egovcp-simulator"):
-        theirs.close()
-        ports = None
-        with suppress(EOFError):
-            if ours.poll(_SIMULATOR_START_S):
-                ports = ours.recv()
-        if ports is None:
-            raise EnvironmentFailure("the simulator did not start, see its message above")
-        fov = config.env.camera.vertical_fov
-        camera = ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov)
-        bridge = BridgeConfig(state_port=ports.state_port, command_port=ports.command_port)
-        yield bridge, CameraOptions(server=camera)
-
-
-def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:
-    """Runs in the simulator's process."""
-    from egovcp_deploy.robots.fake.command import serve
-
-    die_with_parent(parent)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
-    serve(fake, pipe.send)

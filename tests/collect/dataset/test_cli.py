@@ -37,8 +37,14 @@ def test_every_subcommand_lists_its_options(name: str, capsys: pytest.CaptureFix
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),
         (["info", "{sound}", "--json={sound}"], "found a folder, expected a regular file"),
-        (["audit", "{sound}", "--episodes=[0,6]"], "names episode 6, but the dataset has"),
-        (["audit", "{sound}", "--episodes=1000"], "--episodes=1000: for a single episode write"),
+        (
+            ["delete", "{sound}", "--output_dir=new", "--episodes=[0,6]"],
+            "names episode 6, but the dataset has",
+        ),
+        (
+            ["delete", "{sound}", "--output_dir=new", "--episodes=1000"],
+            "--episodes=1000: for a single episode write",
+        ),
     ],
 )
 def test_invalid_arguments_are_usage_errors_in_one_line(

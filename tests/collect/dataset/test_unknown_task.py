@@ -28,12 +28,3 @@ def test_it_is_checked_read_and_described(root: Path) -> None:
     assert reader.read(0).task == "juggle"
     assert EpisodeStore.load([reader]).tasks == ("juggle",) * 4
     assert "| juggle |" in card_text(reader, "me/juggle")
-
-
-def test_its_simulation_names_the_missing_task(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["audit", str(root), "--episodes=[0]"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "unknown task 'juggle'" in line
-    assert "needs that package" in line

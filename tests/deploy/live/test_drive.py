@@ -11,10 +11,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import psutil
 import pytest
@@ -25,7 +24,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from tests.support.robots.fake_g1 import FakeG1Thread, eventually
+from tests.support.robots.fake_g1 import FakeG1Thread, eventually, fake_g1_process
 
 from .conftest import PATIENT, QUICK
 
@@ -91,17 +90,29 @@ class Stand:
 
 
 @pytest.fixture
-def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Callable[..., Stand]]:
+def fake(robot: LiveRobot) -> Iterator[FakeBridge]:
+    """Its time passes."""
     robot.start(Scenario("ball", 0, 0))
-    fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
-    running, programs = FakeG1Thread(fake), list[subprocess.Popen[str]]()
+    found = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
+    running = FakeG1Thread(found)
+    yield found
+    running.stop()
+    found.close()
 
-    def start(*flags: str, before: str = "") -> Stand:
-        folder, ports = tmp_path / "run", fake.ports
+
+type Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(artifact_dir: Path, tmp_path: Path) -> Iterator[Start]:
+    """Starts a run of a tiny planner, recorded in ``tmp_path / "run"``."""
+    programs = list[subprocess.Popen[str]]()
+
+    def start(ports: Ports, *flags: str, before: str = "") -> subprocess.Popen[str]:
         command = [
             *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
-            *(f"--policy.path={artifact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
-            *("--robot.controller=stance", "--log.videos=0"),
+            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
+            *("--robot.controller=stance", "--log.rrd=false", "--log.videos=0"),
             f"--robot.bridge.state_port={ports.state_port}",
             f"--robot.bridge.command_port={ports.command_port}",
             f"--robot.camera.server.port={ports.camera_port}",
@@ -114,7 +125,7 @@ def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Call
             command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
         )
         programs.append(program)
-        return Stand(fake, program, folder)
+        return program
 
     yield start
     for program in programs:
@@ -122,8 +133,14 @@ def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Call
         for process in [c for p in with_children for c in (*p.children(recursive=True), p)]:
             process.kill()
         program.wait()
-    running.stop()
-    fake.close()
+
+
+@pytest.fixture
+def drive(fake: FakeBridge, start: Start, tmp_path: Path) -> Callable[..., Stand]:
+    def drive(*flags: str, before: str = "") -> Stand:
+        return Stand(fake, start(fake.ports, *flags, before=before), tmp_path / "run")
+
+    return drive
 
 
 @pytest.mark.slow
@@ -260,70 +277,33 @@ def test_a_missing_robot_is_reported_at_once(artifact_dir: Path, tmp_path: Path)
     assert list((tmp_path / "run").iterdir()) == []  # the same command can be repeated
 
 
-type Start = Callable[..., subprocess.Popen[str]]
-
-
-@pytest.fixture
-def start(artifact_dir: Path, tmp_path: Path, short: list[str]) -> Iterator[Start]:
-    """Starts a run of a tiny planner that writes into ``tmp_path / "run"``."""
-    programs = list[subprocess.Popen[str]]()
-
-    def start(*flags: str) -> subprocess.Popen[str]:
-        command = [
-            *(sys.executable, "-c", _PROGRAM, "--realtime=true"),
-            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
-            *("--log.rrd=false", *short, *QUICK, *flags),
-        ]
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        program = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
-        programs.append(program)
-        return program
-
-    yield start
-    for program in programs:
-        if program.poll() is None:
-            program.kill()
-        program.wait()
-
-
-def listening(processes: Iterable[psutil.Process]) -> list[Any]:
-    """Where they listen for connections from outside."""
-    return [
-        connection.laddr
-        for process in processes
-        for connection in process.net_connections(kind="inet")
-        if connection.status == psutil.CONN_LISTEN
-    ]
-
-
 @pytest.mark.slow
-def test_a_simulated_episode_is_played_and_recorded(start: Start, tmp_path: Path) -> None:
-    program = start(*PATIENT, "--operator.duration=8")
-    words = program.communicate(timeout=200)[1]
-    assert program.returncode == 0, words
+def test_an_episode_of_the_fake_g1_is_played_and_recorded(
+    start: Start, short: list[str], tmp_path: Path
+) -> None:
+    outcomes = tmp_path / "outcomes.json"
+    with fake_g1_process(*short, "--pause=60", f"--json={outcomes}") as fake:
+        program = start(fake.ports)
+        assert eventually(lambda: outcomes.is_file() or program.poll() is not None)
+    words = program.communicate(timeout=240)[1]
+    assert program.returncode == 6, words  # the robot is gone
     recording = read_recording(tmp_path / "run" / "rollout-0.mcap")
     assert recording.complete
     assert State.RUN in {tick.mode for tick in recording.ticks}
-    (outcome,) = json.loads((tmp_path / "run" / "task.json").read_text())
+    (outcome,) = json.loads(outcomes.read_text())
     assert outcome["ticks"] == 15
 
 
-def test_a_killed_run_leaves_no_process_and_listens_on_the_loopback_only(
-    start: Start, tmp_path: Path
-) -> None:
-    program = start()
-
-    def begun() -> bool:
-        try:
-            return len(read_recording(tmp_path / "run" / "rollout-0.mcap").ticks) > 3
-        except DataError:
-            return False
-
-    assert eventually(begun)
-    children = psutil.Process(program.pid).children(recursive=True)
-    assert {address.ip for address in listening([psutil.Process(program.pid), *children])} == {
-        "127.0.0.1"
-    }
-    program.kill()
-    assert len(children) >= 3  # simulator, control, log
+def test_a_killed_run_leaves_no_process_and_listens_nowhere(drive: Callable[..., Stand]) -> None:
+    stand = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
+    assert eventually(lambda: len(stand.modes()) > 3)
+    program = psutil.Process(stand.program.pid)
+    children = program.children(recursive=True)
+    assert len(children) >= 2  # control, log
+    connections = [c for p in (program, *children) for c in p.net_connections(kind="inet")]
+    assert connections  # with the robot
+    assert psutil.CONN_LISTEN not in {connection.status for connection in connections}
+    stand.program.kill()
+    stand.fake.faults.freeze_state = True  # a robot that may stand is held, not abandoned
     assert not psutil.wait_procs(children, timeout=300)[1]
+    assert not stand.holds

@@ -4,56 +4,31 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
+from egovcp_deploy.robots.bridge import BridgeRobot
 from egovcp_deploy.robots.fake.command import StepPacer, main
 from tests.support.lockstep import LockstepClock
+from tests.support.robots.fake_g1 import bridge_config, fake_g1_process
 
-FLAGS = (
-    "--ports.command_port=0",
-    "--ports.state_port=0",
-    "--ports.camera_port=0",
-    "--env.controller=stance",
-)
-
-
-def start(*flags: str) -> subprocess.Popen[str]:
-    module = "egovcp_deploy.robots.fake.command"
-    return subprocess.Popen(
-        [sys.executable, "-m", module, *FLAGS, *flags],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
-def ports_of(process: subprocess.Popen[str]) -> BridgeConfig:
-    assert process.stdout is not None
-    for line in process.stdout:
-        if "listening" in line:
-            assert "127.0.0.1" in line
-            words = line.replace(",", "").replace(";", "").split()
-            command, state = (int(words[words.index(w) + 1]) for w in ("commands", "states"))
-            return BridgeConfig(state_port=state, command_port=command)
-    raise AssertionError("it never listened")
+STANCE = "--env.controller=stance"
 
 
 def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> None:
     out = tmp_path / "outcomes.json"
-    process = start("--episodes=1", "--settle=0", "--pause=0", f"--json={out}")
-    robot = BridgeRobot(ports_of(process))
-    robot.connect()
-    robot.close()
-    assert process.stdin is not None
-    process.stdin.write("nonsense\nrelease\n")  # without commands it falls
-    process.stdin.flush()
-    text, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
+    flags = ("--episodes=1", "--settle=0", "--pause=0", f"--json={out}")
+    with fake_g1_process(STANCE, *flags) as fake:
+        assert fake.ports.host == "127.0.0.1"
+        robot = BridgeRobot(bridge_config(fake))
+        robot.connect()
+        robot.close()
+        assert fake.program.stdin is not None
+        fake.program.stdin.write("nonsense\nrelease\n")  # without commands it falls
+        fake.program.stdin.flush()
+        text, _ = fake.program.communicate(timeout=60)
+    assert fake.program.returncode == 0
     assert "unknown 'nonsense'" in text
     assert "fell after" in text
     (outcome,) = json.loads(out.read_text())
@@ -63,18 +38,16 @@ def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(("word", "code"), [("quit", 0), ("crash", 1)])
 def test_it_ends_on_a_console_command(word: str, code: int) -> None:
-    process = start()
-    ports_of(process)
-    process.communicate(f"{word}\n", timeout=60)
-    assert process.returncode == code
+    with fake_g1_process(STANCE) as fake:
+        fake.program.communicate(f"{word}\n", timeout=60)
+    assert fake.program.returncode == code
 
 
 def test_it_ends_on_an_interrupt() -> None:
-    process = start()
-    ports_of(process)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 0
+    with fake_g1_process(STANCE) as fake:
+        fake.program.send_signal(signal.SIGINT)
+        fake.program.communicate(timeout=60)
+    assert fake.program.returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -88,7 +61,7 @@ def test_it_ends_on_an_interrupt() -> None:
 def test_bad_options_are_refused(
     flag: str, code: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*FLAGS, flag]) == code
+    assert main([STANCE, flag]) == code
     assert words in capsys.readouterr().err
 
 

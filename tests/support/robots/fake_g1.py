@@ -1,15 +1,19 @@
-"""Runs a fake G1 in a thread."""
+"""Runs a fake G1 in a thread, or `egovcp-fake-g1` in a process."""
 
 from __future__ import annotations
 
 import os
+import re
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge
+from egovcp_deploy.robots.fake import FakeBridge, Ports
 
 TIMEOUT_S = 120.0
 
@@ -49,7 +53,35 @@ class FakeG1Thread:
         self._thread.join()
 
 
-def bridge_config(fake: FakeBridge, mode: int | None = None) -> BridgeConfig:
+@dataclass(frozen=True)
+class FakeG1Process:
+    """A running `egovcp-fake-g1`, and where it listens."""
+
+    program: subprocess.Popen[str]
+    ports: Ports
+
+
+@contextmanager
+def fake_g1_process(*flags: str) -> Iterator[FakeG1Process]:
+    """`egovcp-fake-g1` at free ports, which listens; killed when the context is left."""
+    free = ("--ports.command_port=0", "--ports.state_port=0", "--ports.camera_port=0")
+    command = [sys.executable, "-m", "egovcp_deploy.robots.fake.command", *free, *flags]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as program:
+        assert program.stdout is not None
+        try:
+            begin = program.stdout.readline()
+            while begin and "listening" not in begin:
+                begin = program.stdout.readline()
+            found = re.search(r"on (\S+): commands (\d+), states (\d+), depth (\d+);", begin)
+            assert found, "it does not listen"
+            host, *ports = found.groups()
+            yield FakeG1Process(program, Ports(host, *map(int, ports)))
+        finally:
+            program.kill()
+
+
+def bridge_config(fake: FakeBridge | FakeG1Process, mode: int | None = None) -> BridgeConfig:
     """Connection options for ``fake``."""
     ports = fake.ports
     return BridgeConfig(ports.host, ports.state_port, ports.command_port, mode)

@@ -11,13 +11,21 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.sim.config import SensorConfig
-from egovcp.spec import ACTION_BOX, ACTION_ETA, ACTION_RATE_LIMIT
+from egovcp.spec import ACTION_BOX, ACTION_ETA, ACTION_RATE_LIMIT, JOINT_NAMES
 from egovcp_train.lowlevel import evaluate, skills, trial
 from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.evaluate import main
 from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.trial import _directions, _lag, _rotation, _velocity_error, play
+from egovcp_train.lowlevel.trial import (
+    _directions,
+    _lag,
+    _rotation,
+    _torque_rms,
+    _velocity_error,
+    play,
+)
 
 
 def _rng() -> np.random.Generator:
@@ -97,6 +105,18 @@ def test_the_cameras_rotation_is_that_of_the_torso_between_planner_ticks():
         np.testing.assert_allclose(found, [[0, 0.433 * apart, 0], [0, 0, 0]], atol=1e-3)
 
 
+def test_the_rms_torque_counts_only_the_ticks_before_a_fall():
+    torque = np.zeros((4, 2, 29))
+    torque[:, 0] = 0.5 * EFFORT_LIMIT
+    torque[:2, 1] = np.array([3.0, 4.0])[:, None] / 10.0 * EFFORT_LIMIT
+    torque[2:, 1] = np.nan
+    counted = np.ones((4, 2), dtype=bool)
+    counted[2:, 1] = False
+    np.testing.assert_allclose(_torque_rms(torque, counted)[0], 0.5)
+    np.testing.assert_allclose(_torque_rms(torque, counted)[1], np.sqrt(12.5) / 10.0)
+    assert np.isnan(_torque_rms(torque, np.zeros((4, 2), dtype=bool))).all()
+
+
 def test_a_push_along_the_heading_goes_forwards_or_backwards():
     skill = Skill("trial", "", 1.0, skills.neutral, push=1.0, push_any=False)
     assert set(_directions(skill, 32, _rng())) == {0.0, np.pi}
@@ -147,9 +167,14 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures["squat"]["stepping_share"] == 0.0
     assert len(figures["squat"]["camera_px_per_step"]) == 3
     assert len(figures["squat"]["camera_px_8_steps"]) == 3
+    torques = figures["squat"]["torque_rms_relative"]
+    assert list(torques) == list(JOINT_NAMES)
+    hottest = max(torques, key=torques.get)
+    assert 0.02 < torques[hottest] < 0.5
     assert figures["_run"]["controller"] == make_controller("walk").id
     out = capsys.readouterr().out
     assert "squat" in out
+    assert hottest.removesuffix("_joint").removeprefix("left_").removeprefix("right_") in out
     rows = out[out.index("skill") : out.index("figures:")].splitlines()
     assert max(len(row) for row in rows) <= 120
 

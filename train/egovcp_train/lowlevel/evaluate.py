@@ -56,8 +56,7 @@ class LowLevelEvalConfig:
     planner steps (of 40 ms) apart, in pixels of the depth image: up, across, and at the image's
     edge by roll.
     The column torque is the RMS torque of the most loaded joint, relative to its motor's peak
-    torque; lowlevel.json has all joints. The skill rest also compares the torques of the
-    undisturbed robot with what gravity needs at its pose.
+    torque; lowlevel.json has all joints.
     """
 
     output_dir: str
@@ -108,11 +107,9 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     output = Path(config.output_dir)
     require_writable(output)
     figures: dict[str, dict[str, Any]] = {}
-    loads: dict[str, Any] = {}
     complete = False
     try:
         _play_all(config, skills, figures)
-        loads = _standing_load(config) if "rest" in figures else {}
         complete = True
     finally:
         if figures:
@@ -130,7 +127,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
                 )
                 echo(f"INCOMPLETE: {', '.join(counts)} robots have played")
             output.mkdir(parents=True, exist_ok=True)
-            write_json(output / RESULT, figures | loads | {"_run": run})
+            write_json(output / RESULT, figures | {"_run": run})
             echo(f"figures: {output / RESULT}")
 
 
@@ -229,21 +226,6 @@ def _figures(skill: Skill, parts: Sequence[Any], requested: int) -> dict[str, An
     by_joint = zip(JOINT_NAMES, torque.mean(axis=0).tolist(), strict=True) if len(torque) else None
     out["torque_rms_relative"] = dict(by_joint) if by_joint else None
     return out
-
-
-def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
-    """Torques at rest against what gravity needs; prints the worst joint."""
-    from egovcp_train.lowlevel.torque import describe, standing_load
-
-    load = standing_load(make_controller(config.controller), config.feet)
-    echo(describe(load))
-    columns = (load.mean.tolist(), load.needed.tolist(), load.excess.tolist())
-    joints = {
-        name: dict(zip(("mean_nm", "needed_nm", "excess_relative"), row, strict=True))
-        for name, *row in zip(JOINT_NAMES, *columns, strict=True)
-    }
-    within = bool((load.excess <= 0.0).all())
-    return {"_standing_load": {"within_bar": within, "joints": joints}}
 
 
 def table(figures: dict[str, dict[str, Any]]) -> str:

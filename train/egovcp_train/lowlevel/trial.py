@@ -16,7 +16,7 @@ from egovcp.errors import SimulationDiverged, UsageError
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.robot.arms import nearest_reachable
 from egovcp.robot.controllers import LowLevelController
-from egovcp.robot.g1 import WAIST
+from egovcp.robot.g1 import EFFORT_LIMIT, WAIST
 from egovcp.robot.geometry import rotation_matrix, rotation_vector
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
@@ -44,7 +44,6 @@ from egovcp_train.lowlevel.physics import (
 )
 from egovcp_train.lowlevel.sensing import heading, in_heading, measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
-from egovcp_train.lowlevel.torque import relative_rms
 
 Array = NDArray[np.float64]
 _FALLEN_TILT: Final = 1.0  # rad
@@ -210,12 +209,19 @@ def _measure(
         stepping=_mean(series["stepping"], alive),
         camera=_rotation(series["torso"], planned, 1),
         camera_8=_rotation(series["torso"], planned, 8),
-        torque_rms=relative_rms(series["torque"], alive),
+        torque_rms=_torque_rms(series["torque"], alive),
     )
 
 
+def _torque_rms(torque: Array, counted: NDArray[np.bool_]) -> Array:
+    """(T, N, 29) N m -> (N, 29) relative to the motor's peak, for which Unitree publishes no
+    continuous rating. Winding losses, which heat a motor, grow with the square of the torque."""
+    return np.sqrt(_mean((torque / EFFORT_LIMIT) ** 2, counted))
+
+
 def _mean(series: Array, counted: NDArray[np.bool_]) -> Array:
-    """(T, N) -> (N,) over the counted ticks."""
+    """(T, N, ...) -> (N, ...) over the counted ticks (T, N); NaN where there are none."""
+    counted = counted.reshape(*counted.shape, *[1] * (series.ndim - 2))
     number = counted.sum(axis=0)
     total = np.where(counted, np.nan_to_num(series), 0.0).sum(axis=0)
     return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
@@ -226,8 +232,7 @@ def _rotation(torso: Array, counted: NDArray[np.bool_], apart: int) -> Array:
     if len(torso) <= apart:
         return np.full((counted.shape[1], 3), np.nan)
     turned = np.abs(sensing.pixels(rotation_vector(torso[:-apart], torso[apart:])))
-    both = counted[:-apart] & counted[apart:]
-    return np.stack([_mean(turned[..., axis], both) for axis in range(3)], axis=-1)
+    return _mean(turned, counted[:-apart] & counted[apart:])
 
 
 def _highest(series: Array, counted: NDArray[np.bool_]) -> Array:

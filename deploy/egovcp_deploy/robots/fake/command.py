@@ -85,27 +85,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(config: FakeG1Config) -> None:
-    """Serve until the episodes are over or the user interrupts it."""
+    """Serve until the episodes are over or the user interrupts it. Raises `EnvironmentFailure` if a
+    port is in use."""
     with stop_on_signal(signals=(signal.SIGINT,)) as interrupts:
-        serve(config, interrupts=interrupts)
+        _serve(config, interrupts)
     if interrupts:
         _print("interrupted")
 
 
-def serve(
-    config: FakeG1Config,
-    opened: Callable[[Ports], None] = lambda ports: None,
-    interrupts: Sequence[int] = (),
-) -> None:
-    """Serve until the episodes are over or a signal handler extends ``interrupts``. ``opened`` is
-    called with the ports once the robot listens. Raises `EnvironmentFailure` if a port is in use.
-    """
+def _serve(config: FakeG1Config, interrupts: Sequence[int]) -> None:
+    """Serve until the episodes are over or a signal handler extends ``interrupts``."""
     numbers = range(config.episodes) if config.episodes else count()
     scenarios = (held_out(config.task, config.seed, config.episode + i) for i in numbers)
     lines = queue.SimpleQueue[str]()
     with closing(FakeBridge(LiveRobot(config.env), config.ports, config.detailed)) as bridge:
         episodes, ports = EpisodeSequencer(bridge, config, scenarios, _print), bridge.ports
-        opened(ports)
         _print(
             f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
             f"depth {ports.camera_port}; Ctrl-C ends it"
