@@ -81,17 +81,12 @@ def group_episodes(
 
 
 class EpisodeOrder:
-    """Endless epochs over the episodes of each group in the shard of one process."""
+    """Endless epochs over the episodes of each group."""
 
-    def __init__(
-        self, index: EpisodeIndex, groups: EpisodeGroups, rank: int, ranks: int, seed: int
-    ) -> None:
-        """Take the files of process ``rank`` of ``ranks``; shards are disjoint."""
-        if not 0 <= rank < ranks:
-            raise UsageError(f"rank {rank} of {ranks}: expected to count from 0")
-        self._seed = (seed, rank)
+    def __init__(self, index: EpisodeIndex, groups: EpisodeGroups, seed: int) -> None:
+        self._seed = seed
         drawn = np.flatnonzero(groups.share > 0)
-        self._files = [_assign_files(_files(index, groups.of == g), rank, ranks) for g in drawn]
+        self._files = [_files(index, groups.of == g) for g in drawn]
         self._epoch = [0] * len(drawn)
         self._cursor = [0] * len(drawn)
         self._episodes = [self._shuffle(g) for g in range(len(drawn))]
@@ -99,11 +94,6 @@ class EpisodeOrder:
         mean = np.array([index.length[np.concatenate(files)].mean() for files in self._files])
         rate = groups.share[drawn] / mean
         self._rate = rate / rate.sum()
-
-    @property
-    def episodes(self) -> Numbers:
-        """All episodes of the shard, in the order of the index."""
-        return np.sort(np.concatenate([part for files in self._files for part in files]))
 
     def draw(self, rng: np.random.Generator) -> int:
         """The next episode of a group that ``rng`` chooses."""
@@ -130,7 +120,8 @@ class EpisodeOrder:
 
     def _shuffle(self, group: int) -> Numbers:
         """The episodes of a group in the order of its current epoch."""
-        rng = np.random.default_rng((*self._seed, group, self._epoch[group]))
+        # The 0 and the order of the files are those of earlier versions, whose runs can be resumed.
+        rng = np.random.default_rng((self._seed, 0, group, self._epoch[group]))
         files = self._files[group]
         order = rng.permutation(len(files))
         blocks = [order[i : i + FILES_AT_ONCE] for i in range(0, len(order), FILES_AT_ONCE)]
@@ -139,27 +130,8 @@ class EpisodeOrder:
 
 
 def _files(index: EpisodeIndex, chosen: NDArray[np.bool_]) -> list[Numbers]:
+    """The chosen episodes of each file, largest files first."""
     files = index.files
     numbers = np.flatnonzero(chosen).tolist()
-    return [np.array(list(part)) for _, part in groupby(numbers, key=lambda n: files[n])]
-
-
-def _assign_files(files: list[Numbers], rank: int, ranks: int) -> list[Numbers]:
-    """The files of one process; files are split if there are fewer than processes."""
-    episodes = sum(map(len, files))
-    if episodes < ranks:
-        raise UsageError(
-            f"{episodes} episodes of one task and dataset for {ranks} processes; use fewer "
-            "processes"
-        )
-    while len(files) < ranks:
-        largest = max(range(len(files)), key=lambda i: len(files[i]))
-        files[largest : largest + 1] = np.array_split(files[largest], 2)
-    load = [0] * ranks
-    own: list[Numbers] = []
-    for file in sorted(files, key=len, reverse=True):  # largest first, to the smallest shard
-        to = load.index(min(load))
-        load[to] += len(file)
-        if to == rank:
-            own.append(file)
-    return own
+    parts = [np.array(list(part)) for _, part in groupby(numbers, key=lambda n: files[n])]
+    return sorted(parts, key=len, reverse=True)

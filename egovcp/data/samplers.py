@@ -25,7 +25,6 @@ from egovcp.errors import DataError, UsageError
 from egovcp.robot_spec import RobotSpec
 
 NO_WEIGHTS: Final = Mix()
-ALL_WINDOWS: Final = slice(None)
 
 
 @dataclass(frozen=True)
@@ -72,18 +71,9 @@ class ShuffleConfig:
 class InMemorySampler:
     """Iterator over batches from an `EpisodeStore`."""
 
-    def __init__(
-        self,
-        store: EpisodeStore,
-        config: SamplerConfig,
-        mix: Mix = NO_WEIGHTS,
-        windows: slice = ALL_WINDOWS,
-    ) -> None:
-        """Make the part ``windows`` of each batch: processes that train together draw the same
-        batch, have the same state, and make different parts."""
+    def __init__(self, store: EpisodeStore, config: SamplerConfig, mix: Mix = NO_WEIGHTS) -> None:
         config.check()
         self.store, self.config, self.mix = store, config, mix
-        self._part = windows
         self._rng = np.random.default_rng(config.seed)
         self._fingerprint = store.fingerprint
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
@@ -104,9 +94,8 @@ class InMemorySampler:
         first = store.start[episode]
         latest = first + np.maximum(store.length[episode] - config.span, 0)
         start = np.clip(rows - offset, first, latest)
-        part = self._part
-        batch = gather(store, start[part], episode[part], config.span)
-        return _finish(batch, config, rng, store.robot, part)
+        batch = gather(store, start, episode, config.span)
+        return _finish(batch, config, rng, store.robot)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a sampler that loads it continues with exactly the next batch."""
@@ -151,27 +140,23 @@ class StreamingSampler:
         shuffle: ShuffleConfig | None = None,
         returns: ReturnConfig | None = None,
         checked: bool = True,
-        rank: int = 0,
-        ranks: int = 1,
     ) -> None:
         """Allocate the buffer; nothing is read before the first batch.
 
         Args:
             checked: all episodes were validated; if not, each is validated when it is first read.
-            rank: this process of ``ranks`` that train together; each has its own episodes.
         """
         self._shuffle = shuffle or ShuffleConfig()
         self._shuffle.check()
         config.check()
         self.index, self.config, self.mix = index, config, mix
-        self._rank = {"rank": rank, "ranks": ranks}
         self._returns = returns or ReturnConfig()
         self._checked = np.full(len(index), checked)
         groups = group_episodes(mix, index.dataset, index.tasks, index.length)
-        self._order = EpisodeOrder(index, groups, rank, ranks, config.seed)
-        self._rng = np.random.default_rng([config.seed, rank])
+        self._order = EpisodeOrder(index, groups, config.seed)
+        self._rng = np.random.default_rng(config.seed)
         slots = self._shuffle.episodes
-        capacity = np.full(slots, int(index.length[self._order.episodes].max()))
+        capacity = np.full(slots, int(index.length[groups.share[groups.of] > 0].max()))
         none = np.zeros(slots, dtype=np.int64)
         self._slots = EpisodeStore.empty(capacity, none, robot=index.robot)
         self._held: NDArray[np.int64] = np.full(slots, -1)  # episode in each slot
@@ -221,8 +206,7 @@ class StreamingSampler:
         return self
 
     def _options(self) -> dict[str, Any]:
-        parts = (vars(self.config), self.mix.as_dict(), vars(self._shuffle), self._rank)
-        return {name: value for part in parts for name, value in part.items()}
+        return vars(self.config) | self.mix.as_dict() | vars(self._shuffle)
 
     def _refill(self) -> None:
         """Replace the episode of every slot that has no window left."""
@@ -303,18 +287,14 @@ class PrefetchIterator:
 
 
 def _finish(
-    batch: Batch,
-    config: SamplerConfig,
-    rng: np.random.Generator,
-    robot: RobotSpec,
-    part: slice = ALL_WINDOWS,
+    batch: Batch, config: SamplerConfig, rng: np.random.Generator, robot: RobotSpec
 ) -> Batch:
-    """Mask the burn-in of ``part`` of a batch, unless an episode starts there, and reflect half of
-    it if the robot is symmetric."""
+    """Mask the burn-in of a batch, unless an episode starts there, and reflect half of it if the
+    robot is symmetric."""
     batch["valid"] &= ~((np.arange(config.span) < config.burn_in) & (batch["t"][:, :1] > 0))
     if config.mirror and robot.mirror is not None:
         mirrored = rng.random(config.batch_size) < 0.5
-        mirror_windows(batch, np.flatnonzero(mirrored[part]), robot)
+        mirror_windows(batch, np.flatnonzero(mirrored), robot)
     return batch
 
 

@@ -20,7 +20,6 @@ from egovcp.model.config import LossConfig
 from egovcp.model.depth import extreme_3x3, nearness
 from egovcp.model.fused_recurrence import filter_window
 from egovcp.model.latent_state import Carry, Gaussian, kl_divergence
-from egovcp.model.parallel import over_all_rows, row_noise
 from egovcp.model.world_model import WorldModel
 
 #: Images encoded at once without gradient: activations of more no longer fit into the cache.
@@ -102,7 +101,8 @@ def latent_noise(
     """Noise of z, (T, B, Z), sampled step by step."""
     size, length = batch.valid.shape
     shape, device = (size, model.config.latent), batch.state.device
-    return torch.stack([row_noise(shape, generator, device) for _ in range(length)])
+    draws = [torch.randn(shape, generator=generator, device=device) for _ in range(length)]
+    return torch.stack(draws)
 
 
 def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
@@ -116,12 +116,9 @@ def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean of x where mask; 0 where the mask is empty.
-
-    Under `egovcp.model.parallel.data_parallel`: this process' part of the mean.
-    """
+    """Mean of x where mask; 0 where the mask is empty."""
     weight = mask.to(x.dtype)
-    return (x * weight).sum() / over_all_rows(weight.sum()).clamp_min(1.0)
+    return (x * weight).sum() / weight.sum().clamp_min(1.0)
 
 
 def image_error(image: Tensor, near: Tensor, weight: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from egovcp.model.multistep import (
     first_row,
     multistep_losses,
 )
-from egovcp.model.parallel import SINGLE_PROCESS, current_rank, run_parallel
+from egovcp.model.parallel import run_parallel
 from egovcp.model.privileged_value import sample_actions
 from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
@@ -118,8 +118,7 @@ def world_model_gradients(
 
         filtered, imagined = _term_groups(model, leaves, batch, draws, critic)
         first, second = partial(with_gradient, filtered), partial(with_gradient, imagined)
-        # Data-parallel processes synchronise at every mean, so the order must be fixed.
-        if batch.state.device.type == "cpu" and current_rank() is SINGLE_PROCESS:
+        if batch.state.device.type == "cpu":
             (terms, gradients), (more, others) = run_parallel(first, second)
         else:
             (terms, gradients), (more, others) = first(), second()

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model.networks import SplitMlp
-from egovcp.model.parallel import row_noise
 from egovcp.robot_spec import G1, RobotSpec
 
 _UNITS: Final = 256
@@ -66,8 +65,9 @@ def sample_actions(
     rate limit allows.
     """
     size, length, dim = previous.shape
-    noise = row_noise((size, length * count * dim), generator, previous.device)
-    target = torch.erf(noise.view(size, length, count, dim) * 0.5**0.5)  # uniform in (-1, 1)
+    shape = (size, length, count, dim)
+    noise = torch.randn(shape, generator=generator, device=previous.device)
+    target = torch.erf(noise * 0.5**0.5)  # uniform in (-1, 1)
     limit = spec.ACTION_RATE_LIMIT
     previous = previous[:, :, None]
     return previous + (target - previous).clamp(-limit, limit)

@@ -55,7 +55,7 @@ def _named(text: str, own: set[str]) -> Iterator[str]:
     for line in text.splitlines():
         program = ""
         for word in re.split(r"[\s`'\",;()]+", line):
-            if re.match(r"egovcp-\w|lerobot-\w|docker|pip|uv|accelerate", word):
+            if re.match(r"egovcp-\w|lerobot-\w|docker|pip|uv", word):
                 program = word
             for flag in FLAG.findall(word.replace(".NAME", "")):
                 other = _flags_of_programs(program) if program.startswith("egovcp-") else own

@@ -28,7 +28,7 @@ _PLACEHOLDERS = {
 #: Inline commands that are part of a sentence may lack what the program requires.
 _INCOMPLETE = re.compile(r"option \S+ is missing")
 #: Flags of programs that are neither ours nor among those that `programs` knows.
-_FOREIGN = {"--cpu": "accelerate launch", "--dataset.fps": "lerobot-record"}
+_FOREIGN = {"--dataset.fps": "lerobot-record"}
 
 
 def pages() -> dict[str, Page]:

@@ -1,6 +1,5 @@
 """The fit of the privileged value, and training with it."""
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +10,8 @@ import torch
 
 from egovcp import spec
 from egovcp.data import EpisodeIndex, EpisodeStore, open_dataset
-from egovcp.model import Batch, WorldModel
+from egovcp.model import WorldModel
 from egovcp.model.losses import filter_sequence
-from egovcp.model.parallel import DataParallelRank, data_parallel
 from egovcp.model.privileged_value import PrivilegedValue, sample_actions
 from egovcp.plan import PlannerConfig
 from egovcp.testing import random_batch, toy_model
@@ -23,7 +21,6 @@ from egovcp_train.config import PrivilegedValueConfig
 from egovcp_train.loop import Budget
 from egovcp_train.privileged_value import Critic, Transitions
 from egovcp_train.train import main
-from tests.support.data_parallel import in_two_processes
 
 type Arguments = Callable[..., list[str]]
 
@@ -139,38 +136,6 @@ def test_while_a_model_is_trained_its_q_chooses_the_next_action(
     expected = torch.autograd.grad(loss, critic.parameters)
     for parameter, gradient in zip(critic.parameters, expected, strict=True):
         torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-3)
-
-
-def test_two_processes_have_the_error_and_gradient_of_the_whole_batch() -> None:
-    batch = random_batch(4, 6, seed=3)
-    batch.valid[0, 2:] = False
-    batch.terminal_next[2, -1] = True
-    batch.is_first[3, 4] = True
-    model = toy_model().requires_grad_(False)
-    states = filter_sequence(model, batch, sample=False).carry
-    sampled = sample_actions(batch.prev_action, 3, torch.Generator().manual_seed(0))
-
-    torch.manual_seed(0)
-    value = PrivilegedValue(batch.privileged.shape[-1])
-
-    def work(share: DataParallelRank) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        critic = Critic(copy.deepcopy(value), _PLANNER, lr=1e-3)
-        rows = slice(share.rank * 4 // share.ranks, (share.rank + 1) * 4 // share.ranks)
-        with data_parallel(share):
-            error = critic.compute_gradients(
-                model,
-                Batch(*(x[rows] for x in batch)),
-                states.map(lambda x: x[rows]),
-                sampled[rows],
-                torch.Generator().manual_seed(7),
-            )
-        return error, [x.grad for x in critic.parameters if x.grad is not None]
-
-    whole, gradients = work(DataParallelRank())
-    (first, own), (second, others) = in_two_processes(work)
-    torch.testing.assert_close(first + second, whole)
-    for a, b, expected in zip(own, others, gradients, strict=True):
-        torch.testing.assert_close(a + b, expected, rtol=1e-3, atol=1e-5)
 
 
 def test_the_target_network_follows_the_value() -> None:

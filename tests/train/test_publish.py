@@ -173,7 +173,7 @@ def test_a_run_that_is_stopped_is_not_published(
     hub: FakeHub, arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stopped = nullcontext([15])  # as if a signal had come
-    monkeypatch.setattr("egovcp_train.train.stop_on_signal", lambda _: stopped)
+    monkeypatch.setattr("egovcp_train.train.stop_on_signal", lambda: stopped)
     assert train(arguments(tmp_path / "run", *TO_HUB)) == 130
     assert hub.requests["commit"] == 0
 

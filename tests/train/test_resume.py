@@ -291,12 +291,26 @@ def test_a_checkpoint_of_another_version_is_refused(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
-    folder = output / "checkpoints" / "last" / "training_state"
     state = load_training_state(output)
     del (state if name in state else state["learner"])[name]
+    _replace_state(output, state)
+    _refused([f"--output_dir={output}", "--resume"], 4, capsys, name)
+
+
+def test_a_run_of_several_processes_is_not_resumed(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As earlier versions could train: each process had its own stream."""
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    state = load_training_state(output)
+    _replace_state(output, {**state, "streams": 2 * state["streams"]})
+    _refused([f"--output_dir={output}", "--resume"], 4, capsys, "too many values")
+
+
+def _replace_state(output: Path, state: dict[str, object]) -> None:
+    folder = output / "checkpoints" / "last" / "training_state"
     torch.save(state, folder / checkpoint.STATE_FILE)
     (folder / checkpoint.DIGEST_FILE).unlink()
-    _refused([f"--output_dir={output}", "--resume"], 4, capsys, name)
 
 
 def test_run_of_a_version_with_a_ball_tracker_is_not_resumed(

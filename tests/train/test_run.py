@@ -23,7 +23,6 @@ from egovcp.errors import UsageError
 from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS as MODELS
 from egovcp.model import Batch
-from egovcp_train import device
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import ABLATIONS, PRESETS, TrainConfig
 from egovcp_train.device import choose_bf16
@@ -222,6 +221,17 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
     _refused(arguments(place / "run"), 5, capsys, f"cannot write to {place}")
 
 
+def test_several_processes_are_refused(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")  # as set by torchrun and accelerate launch
+    _refused(arguments(tmp_path / "run"), 2, capsys, "WORLD_SIZE=2 in the environment")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
@@ -229,7 +239,7 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"batch_size": 0}, "--batch_size"),
         ({"save_freq": 0}, "--save_freq"),
         ({"device": "abacus"}, "--device"),
-        ({"mixed_precision": "fp8"}, "--mixed_precision=fp8; expected no or bf16"),
+        ({"mixed_precision": "fp8"}, "--mixed_precision=fp8; expected no, bf16 or auto"),
         ({"preset": "huge"}, "unknown --preset=huge"),
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
@@ -313,29 +323,11 @@ def test_bfloat16_learns_about_the_same(arguments: Arguments, tmp_path: Path) ->
     assert all((a - b).abs().max() < 0.02 for a, b in pairs)
 
 
-def test_what_the_launcher_says_of_precision_holds_where_no_flag_does(
-    arguments: Arguments,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "fp16")
-    flags = arguments(tmp_path / "run", mixed_precision="auto")
-    _refused(flags, 2, capsys, "--mixed_precision=fp16; expected no or bf16")
-    cpu = torch.device("cpu")
-    monkeypatch.setattr(device, "_computes_in_bf16", lambda where: False)
-    assert not choose_bf16("no", cpu)
-    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "bf16")
-    assert choose_bf16("auto", cpu)
-    assert not choose_bf16("no", cpu)
-
-
 @pytest.mark.parametrize("native", [True, False])
 def test_bfloat16_is_chosen_where_the_device_computes_in_it(
     native: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": native})
-    monkeypatch.delenv("ACCELERATE_MIXED_PRECISION", raising=False)
     assert choose_bf16("auto", torch.device("cpu")) == native
     assert not choose_bf16("no", torch.device("cpu"))
 

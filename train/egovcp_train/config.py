@@ -180,8 +180,7 @@ class TrainConfig:
     steps, so that a run is not reproducible step by step; 0: no limit. A resumed run has the rest
     of it."""
     batch_size: int = bounded(32, least=1, most=65_536)
-    """Windows per gradient step and process; under accelerate launch all processes together make
-    one step of batch_size * num_processes windows."""
+    """Windows per gradient step."""
     seed: int = bounded(0, least=0)
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
@@ -199,8 +198,7 @@ class TrainConfig:
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"
-    """Precision of matrix products: no, bf16, or auto (as set by accelerate launch, otherwise
-    bf16 if the hardware supports it)."""
+    """Precision of matrix products: no, bf16, or auto (bf16 if the hardware supports it)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)

@@ -36,7 +36,6 @@ from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
 from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
-from egovcp_train.distributed import SINGLE, ProcessGroup
 
 EVALUATION_EPISODES: Final = 512
 """Held-out episodes of each task; with fewer, R2 of Q depends on which ones they are."""
@@ -68,35 +67,18 @@ class TrainingData:
 
 
 def prepare(
-    config: TrainConfig,
-    readers: tuple[DatasetReader, ...],
-    model: WorldModel,
-    group: ProcessGroup = SINGLE,
+    config: TrainConfig, readers: tuple[DatasetReader, ...], model: WorldModel
 ) -> TrainingData:
     """Read the datasets and fix the model's statistics.
 
     Local datasets are read and checked completely, of datasets that are streamed from the Hub a
-    sample of the files. The first process downloads and checks before the others start.
+    sample of the files.
 
     Raises:
         UsageError: the options contradict each other.
         DataError: a dataset is damaged, or not finite.
         EnvironmentFailure: the Hub cannot be reached.
     """
-    if group.is_first:
-        data = _prepare(config, readers, model, group)
-        group.broadcast(data.config.loading)
-        return data
-    loading = group.broadcast(config.loading)
-    return _prepare(dataclasses.replace(config, loading=loading), readers, model, group)
-
-
-def _prepare(
-    config: TrainConfig,
-    readers: tuple[DatasetReader, ...],
-    model: WorldModel,
-    group: ProcessGroup,
-) -> TrainingData:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
@@ -107,16 +89,16 @@ def _prepare(
                 f"--returns.weights: {reader.root} was written by an earlier version and does not "
                 "have the reward terms; leave the weights out, or collect again"
             )
-    config = pinned(_resolved(config, readers, group), readers)
+    config = pinned(_resolved(config, readers), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    return TrainingData(readers, config, *build(readers, config, sampling, mix, model, group))
+    return TrainingData(readers, config, *build(readers, config, sampling, mix, model))
 
 
-def converted(config: TrainConfig, group: ProcessGroup) -> TrainConfig:
-    """The options with OUTPUT_DIR/dataset as the dataset, into which the first process has
-    converted the one that has other features; unchanged without ``features``.
+def converted(config: TrainConfig) -> TrainConfig:
+    """The options with OUTPUT_DIR/dataset as the dataset, into which the one that has other
+    features is converted; unchanged without ``features``.
 
     Raises:
         UsageError: --datasets or --returns.weights is given too, or the dataset has no such
@@ -137,19 +119,10 @@ def converted(config: TrainConfig, group: ProcessGroup) -> TrainConfig:
             "leave the weights out"
         )
     root = Path(config.output_dir).absolute() / "dataset"
-    if group.is_first:
-        source = locate(config.dataset, config.loading.network)
-        convert_dataset(source, config.features, root, config.dataset.episodes)
-    group.broadcast(None)
+    source = locate(config.dataset, config.loading.network)
+    convert_dataset(source, config.features, root, config.dataset.episodes)
     dataset = SelectedDatasetConfig(repo_id=config.dataset.repo_id, root=str(root))
     return dataclasses.replace(config, dataset=dataset, features={})
-
-
-def open_in_turn(config: TrainConfig, group: ProcessGroup) -> tuple[DatasetReader, ...]:
-    """As `open_readers`; the first process downloads before the others start."""
-    readers = open_readers(config) if group.is_first else ()
-    group.broadcast(None)
-    return readers or open_readers(config)
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
@@ -250,13 +223,11 @@ def stream_config(config: TrainConfig) -> SamplerConfig:
     return SamplerConfig(config.batch_size, own.length, own.burn_in, own.mirror, seed=config.seed)
 
 
-def _resolved(
-    config: TrainConfig, readers: Sequence[DatasetReader], group: ProcessGroup
-) -> TrainConfig:
+def _resolved(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
     """The options with the mode that auto selects here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES * group.local
+    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
@@ -267,16 +238,13 @@ def _in_memory(
     sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
-    group: ProcessGroup,
 ) -> Built:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     _require_returns(readers, learning)
     set_normalisation(model, learning, config.returns)
-    rows = group.rows(sampling.batch_size)
-    sampling = dataclasses.replace(sampling, batch_size=group.count * sampling.batch_size)
-    stream = PrefetchIterator(InMemorySampler(learning, sampling, mix, rows))
+    stream = PrefetchIterator(InMemorySampler(learning, sampling, mix))
     return stream, heldout, lambda: learning
 
 
@@ -286,7 +254,6 @@ def _on_disk(
     sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
-    group: ProcessGroup,
 ) -> Built:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = learning
@@ -305,9 +272,7 @@ def _on_disk(
         sampling,
         mix,
         config.loading.shuffle,
-        rank=group.rank,
-        ranks=group.count,
-        returns=config.returns,
+        config.returns,
         checked=not learning.is_remote,
     )
     return PrefetchIterator(stream), heldout, without_images

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import os
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final
@@ -39,20 +38,16 @@ def choose_device(name: str) -> torch.device:
 def choose_bf16(name: str, device: torch.device) -> bool:
     """Whether matrix products are in bfloat16, for a value of ``--mixed_precision``.
 
-    auto: as set by ``accelerate launch``, else if the device computes in it; emulated bfloat16
-    is slower than float32.
+    auto: if the device computes in it; emulated bfloat16 is slower than float32.
 
     Raises:
-        UsageError: the value is neither no nor bf16.
+        UsageError: the value is another one than no, bf16 and auto.
     """
-    chosen = name
     if name == "auto":
-        own = "bf16" if _computes_in_bf16(device) else "no"
-        chosen = os.environ.get("ACCELERATE_MIXED_PRECISION", own)
-    if chosen not in ("no", "bf16"):
-        source = "accelerate launch " if name == "auto" else ""
-        raise UsageError(f"{source}--mixed_precision={chosen}; expected no or bf16")
-    return chosen == "bf16"
+        return _computes_in_bf16(device)
+    if name not in ("no", "bf16"):
+        raise UsageError(f"--mixed_precision={name}; expected no, bf16 or auto")
+    return name == "bf16"
 
 
 def _computes_in_bf16(device: torch.device) -> bool:

@@ -16,12 +16,10 @@ from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
 from egovcp.model.latent_state import Carry
-from egovcp.model.parallel import data_parallel
 from egovcp.model.value_losses import TargetNetwork
 from egovcp.plan import PlannerConfig
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
-from egovcp_train.distributed import SINGLE, ProcessGroup
 from egovcp_train.privileged_value import Critic
 
 _MOST_GRAPHS: Final = 64
@@ -48,18 +46,19 @@ class Learner:
         model: WorldModel,
         config: OptimizerConfig,
         seed: int,
-        group: ProcessGroup = SINGLE,
         bf16: bool = False,
         planner: PlannerConfig | None = None,
     ) -> None:
-        """All processes of ``group`` start from the same ``model`` and ``seed``.
-
+        """
         Args:
+            model: the networks, which are trained in place.
+            config: optimiser and learning rate.
+            seed: seed of the random stream.
+            bf16: compute matrix products in bfloat16.
             planner: costs of the actions that the critic plans.
         """
         self.model = model
         self.config = config
-        self.group = group
         self.bf16 = bf16
         self.planner = planner or PlannerConfig()
         self.critic: Critic | None = None
@@ -74,7 +73,7 @@ class Learner:
         self._skipped = 0
         self._parameters = list(model.parameters())
         self._gradients: Callable[[Batch, StepNoise], Gradients] = self._compute_gradients
-        if device.type == "cuda" and group.count == 1:
+        if device.type == "cuda":
             self._gradients = GraphedFunction(
                 self._compute_gradients, max_graphs=_MOST_GRAPHS, copies=False
             )
@@ -90,26 +89,20 @@ class Learner:
         lr = self.learning_rate(progress)
         for group in self.optimizer.param_groups:
             group["lr"] = lr
-        with data_parallel(self.group.share):
-            noise = sample_step_noise(self.model, batch, self.generator)
-            names, values, gradients, states = self._gradients(batch, noise)
-            critic = self.critic if progress >= _CRITIC_START else None
-            if critic:
-                critic.set_learning_rate(
-                    self.config.privileged_value.training_lr * lr / self.config.lr
-                )
-                error = critic.compute_gradients(
-                    self.model, batch, states, noise.actions, self.generator, self.bf16
-                )
+        noise = sample_step_noise(self.model, batch, self.generator)
+        names, values, gradients, states = self._gradients(batch, noise)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         terms = dict(zip(names, values.clone(), strict=True))
-        terms = self.group.sum_gradients(self._parameters, terms)
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
         total = norm + terms["loss/total"]
+        critic = self.critic if progress >= _CRITIC_START else None
         if critic:
-            found = self.group.sum_gradients(critic.parameters, {"loss/critic": error})
-            terms, total = terms | found, total + found["loss/critic"]
+            critic.set_learning_rate(self.config.privileged_value.training_lr * lr / self.config.lr)
+            terms["loss/critic"] = critic.compute_gradients(
+                self.model, batch, states, noise.actions, self.generator, self.bf16
+            )
+            total = total + terms["loss/critic"]
         if self._is_finite(total):
             self.optimizer.step()
             self._average()

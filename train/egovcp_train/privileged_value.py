@@ -31,7 +31,6 @@ from egovcp.data.privileged import mirror_privileged
 from egovcp.model import Batch, WorldModel
 from egovcp.model.latent_state import Carry
 from egovcp.model.losses import masked_mean
-from egovcp.model.parallel import row_noise
 from egovcp.model.privileged_value import PrivilegedValue, sample_actions
 from egovcp.model.value_losses import bootstrapped
 from egovcp.plan import PlannerConfig
@@ -40,7 +39,6 @@ from egovcp.terminal import echo
 from egovcp_train.config import PrivilegedValueConfig
 from egovcp_train.datasets import TrainingData
 from egovcp_train.device import precision
-from egovcp_train.distributed import ProcessGroup
 
 _WEIGHT_DECAY: Final = 1e-3
 _MIN_STD: Final = 1e-3
@@ -214,7 +212,7 @@ class Critic:
             bf16: compute the Q of ``model`` with matrix products in bfloat16.
         """
         state = model.standardise(batch.state)
-        noise = row_noise((len(state), 1, 6), generator, state.device)
+        noise = torch.randn((len(state), 1, 6), generator=generator, device=state.device)
         features = _with_error(model, batch.privileged, noise)
         with torch.no_grad():
             actions = _candidates(batch.prev_action, batch.action[:, :, None], sampled)
@@ -322,11 +320,10 @@ def fit(
 def prepare(
     model: WorldModel,
     data: TrainingData,
-    group: ProcessGroup,
     progress: Callable[[int], float],
     bf16: bool = False,
 ) -> Critic | None:
-    """`fit` the critic of a run in its first process, and say how well it agrees with returns.
+    """`fit` the critic of a run, and say how well it agrees with returns.
 
     Returns:
         None if the target of Q is another one, also because the data lacks positions of objects.
@@ -335,33 +332,20 @@ def prepare(
     if config.policy.loss.q_target != "privileged":
         return None
     if not has_objects(data.heldout):
-        if group.is_first:
-            echo("the data has no positions of objects: Q is fitted to returns")
+        echo("the data has no positions of objects: Q is fitted to returns")
         return None
-    critic = None
-    if group.is_first:
-        critic = fit(
-            model,
-            data.learning(),
-            config.optimizer.privileged_value,
-            config.planner,
-            config.seed,
-            progress,
-            bf16,
-        )
-        found = correlation(model, data.heldout, critic.value)
-        echo(
-            "privileged value: correlation with held-out returns: "
-            + ", ".join(f"{k} {v:.2f}" for k, v in found.items())
-        )
-    if group.count == 1:
-        return critic
-    state = group.broadcast(_on_cpu(critic.state_dict()) if critic else {})
-    return Critic.restore(state, model, config.planner)
-
-
-def _on_cpu(tree: Any) -> Any:
-    """The same nested dictionaries with tensors in the memory of the CPU."""
-    if isinstance(tree, dict):
-        return {key: _on_cpu(value) for key, value in tree.items()}
-    return tree.cpu() if isinstance(tree, Tensor) else tree
+    critic = fit(
+        model,
+        data.learning(),
+        config.optimizer.privileged_value,
+        config.planner,
+        config.seed,
+        progress,
+        bf16,
+    )
+    found = correlation(model, data.heldout, critic.value)
+    echo(
+        "privileged value: correlation with held-out returns: "
+        + ", ".join(f"{k} {v:.2f}" for k, v in found.items())
+    )
+    return critic

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,14 +44,13 @@ from egovcp_train.datasets import (
     FRAME_BYTES,
     TrainingData,
     converted,
-    open_in_turn,
+    open_readers,
     prepare,
     require_datasets,
     require_same_content,
     to_tensors,
 )
 from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
-from egovcp_train.distributed import ProcessGroup, join_processes
 from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
 from egovcp_train.loop import Budget, Learner
@@ -62,7 +62,6 @@ EPILOG = (
     "Other options are set by --preset, or by a file instead: copy train_config.yaml of a run, "
     "edit it, and give --config_path."
 )
-LAUNCHER_ECHO_S = 5.0
 _FIT_SHARE: Final = 0.25  # part of --max_minutes that the fit of the critic takes at most
 _BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
@@ -94,55 +93,63 @@ def train(config: TrainConfig) -> None:
 
     Raises:
         KeyboardInterrupt: a signal ended it early; the checkpoint is written.
+        UsageError: a launcher has started several processes.
     """
-    group = join_processes(cpu=config.device == "cpu")  # first: it selects this process' GPU
+    _require_one_process()
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    _require_batch_memory(config, group, device)
-    output = _prepare_output(config, group)
+    _require_batch_memory(config, device)
+    output = _prepare_output(config)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    config = converted(config, group)
-    readers = open_in_turn(config, group)
+    config = converted(config)
+    readers = open_readers(config)
     robot = readers[0].robot
     model = WorldModel(config.policy.world_model(robot), robot)
     initial: dict[str, Tensor] = {}
     if config.policy.pretrained_path and not config.resume:
         initial = pretrained_weights(model, config.policy.pretrained_path)
-    data = prepare(config, readers, model, group)
+    data = prepare(config, readers, model)
     config = data.config
     if initial:
         model.load_state_dict(initial)
-    learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16, config.planner)
+    learner = Learner(model.to(device), config.optimizer, config.seed, bf16, config.planner)
     if config.resume:
         spent = _restore(output, learner, data)
     else:
         updates = config.optimizer.privileged_value.updates
         fitting = Budget(updates, _FIT_SHARE * config.max_minutes)
-        learner.critic = privileged_value.prepare(
-            learner.model, data, group, fitting.progress, bf16
-        )
+        learner.critic = privileged_value.prepare(learner.model, data, fitting.progress, bf16)
         spent = fitting.spent
     provenance = _provenance(data)
     simulation = None
-    if group.is_first:
-        if config.eval_closed_loop:
-            make_evaluator(model, config.planner)  # refuses a backend that cannot be used here
-            tasks, controller = provenance["tasks"], provenance["controller_id"]
-            simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
-        reserve_policy(config.policy)
-        output.mkdir(parents=True, exist_ok=True)
-        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
+    if config.eval_closed_loop:
+        make_evaluator(model, config.planner)  # refuses a backend that cannot be used here
+        tasks, controller = provenance["tasks"], provenance["controller_id"]
+        simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
+    reserve_policy(config.policy)
+    output.mkdir(parents=True, exist_ok=True)
+    save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     TrainingRun(config, output, learner, data, device, provenance, simulation, spent).execute()
 
 
-def _require_batch_memory(config: TrainConfig, group: ProcessGroup, device: torch.device) -> None:
+def _require_one_process() -> None:
+    """Raise `UsageError` under a launcher of several processes, each of which would train alone."""
+    count = os.environ.get("WORLD_SIZE", "1")
+    if count != "1":
+        raise UsageError(
+            f"WORLD_SIZE={count} in the environment: expected one process (1, or unset); start "
+            f"{PROG} itself, without torchrun or accelerate launch"
+        )
+
+
+def _require_batch_memory(config: TrainConfig, device: torch.device) -> None:
     """Raise `UsageError` for a batch that is too large for this machine."""
     size, length = config.batch_size, config.sampling.length
     option = f"--batch_size={size} with --sampling.length={length}"
     copies = _BATCH_COPIES if device.type == "cpu" else 1
-    require_memory(option, size * length * group.local * copies * FRAME_BYTES)
+    require_memory(option, size * length * copies * FRAME_BYTES)
 
 
 class TrainingRun:
@@ -161,12 +168,11 @@ class TrainingRun:
     ) -> None:
         self.config, self.output, self.learner, self.data = config, output, learner, data
         self.device, self.provenance, self.simulation = device, provenance, simulation
-        self.group = learner.group
         self.budget = Budget(config.steps, config.max_minutes, spent=spent)
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
         self.played: dict[str, float] = {}
-        self.recorder = _records(config, output) if self.group.is_first else Records([])
+        self.recorder = _records(config, output)
 
     def execute(self) -> None:
         """Train until the budget or a signal ends it; the last state is always saved.
@@ -176,16 +182,14 @@ class TrainingRun:
         """
         learner = self.learner
         start = learner.step
-        with stop_on_signal(LAUNCHER_ECHO_S if self.group.count > 1 else 0.0) as stopped:
+        with stop_on_signal() as stopped:
             finished = self._learn(stopped)
             final = checkpoint_dir(self.output, learner.step)
-            if learner.step > start or not self.group.broadcast(final.exists()):
-                self.finish(finished)
-        if self.group.is_first:
-            self._conclude(final, finished)
-        self.group.close()
+            if learner.step > start or not final.exists():
+                self.finish()
+        self._conclude(final, finished)
         if not finished:
-            raise KeyboardInterrupt if self.group.is_first else SystemExit(130)
+            raise KeyboardInterrupt
 
     def _conclude(self, final: Path, finished: bool) -> None:
         """Print the result, write the card, and publish a finished policy."""
@@ -199,31 +203,23 @@ class TrainingRun:
             publish_trained(artifact, self.config.policy)
 
     def _learn(self, stopped: list[int]) -> bool:
-        """Step until the budget is spent or a process is stopped; returns whether it is spent."""
+        """Step until the budget is spent or a signal comes; returns whether it is spent."""
         config, learner, start = self.config, self.learner, self.learner.step
         ticks = config.sampling.length + config.sampling.burn_in
-        frames = self.group.count * config.batch_size * ticks
+        frames = config.batch_size * ticks
         warned = False
         with tqdm(
-            total=config.steps,
-            initial=start,
-            unit="step",
-            desc="train",
-            mininterval=1.0,
-            disable=not self.group.is_first,
+            total=config.steps, initial=start, unit="step", desc="train", mininterval=1.0
         ) as bar:
             while True:
                 progress = self.budget.progress(learner.step)
-                progress, stop = self.group.all_reduce(progress, bool(stopped))
-                if progress >= 1.0 or stop:
+                if progress >= 1.0 or stopped:
                     return progress >= 1.0
                 if learner.step > start:
                     self._pause()
                 batch = to_tensors(next(self.data.stream), self.device)
                 terms = learner.update(batch, progress)
                 bar.update()
-                if not self.group.is_first:
-                    continue
                 if learner.step % config.log_freq == 0:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
@@ -234,31 +230,24 @@ class TrainingRun:
     def _pause(self) -> None:
         """Measure, save and record what is due between two steps."""
         config, learner, report = self.config, self.learner, None
-        if self.group.is_first and config.eval_freq and learner.step % config.eval_freq == 0:
-            report = self.measure(learner.averaged)
+        if config.eval_freq and learner.step % config.eval_freq == 0:
+            report = self.measure()
         if learner.step % config.save_freq == 0:
-            self.save(learner.averaged)
+            self.save()
         if report is not None:
             self.show(report)
 
-    def finish(self, finished: bool) -> None:
-        """Measure and save the model, and record the measurements.
+    def finish(self) -> None:
+        """Measure and save the model, and record the measurements."""
+        report = self.measure()
+        self.save()
+        self.show(report)  # after saving: drawing may fail
+        record(report, self.output, self.learner.averaged.config.depth_max_m)
 
-        A launcher gives its processes 30 s to stop, so it only saves an unfinished model.
-        """
-        shipped, report = self.learner.averaged, None
-        if self.group.is_first and (finished or self.group.count == 1):
-            report = self.measure(shipped)
-        self.save(shipped)
-        if report is not None:  # after saving: drawing may fail
-            self.show(report)
-            record(report, self.output, shipped.config.depth_max_m)
-
-    def measure(self, model: WorldModel) -> HeldoutReport:
-        """Measure a model on held-out episodes, and in simulation if configured."""
-        heldout = self.data.heldout
-        episodes = episode_batches(heldout, self.device, EVALUATION_EPISODES)
-        critic = self.learner.critic
+    def measure(self) -> HeldoutReport:
+        """Measure the averaged model on held-out episodes, and in simulation if configured."""
+        episodes = episode_batches(self.data.heldout, self.device, EVALUATION_EPISODES)
+        model, critic = self.learner.averaged, self.learner.critic
         report = measure(model, episodes, critic=critic.value if critic else None)
         self.metrics, self.tasks = report.metrics, report.tasks
         if self.simulation is not None:
@@ -274,26 +263,23 @@ class TrainingRun:
             for name, picture in draw(report).items():
                 self.recorder.image(step, f"heldout/{name}", picture)
 
-    def save(self, model: WorldModel) -> None:
-        """Write a checkpoint: the model as artifact, and the training state of all processes.
+    def save(self) -> None:
+        """Write a checkpoint: the averaged model as artifact, and the training state.
 
         Raises:
             DataError: the model is not finite.
         """
-        streams = self.group.gather(self.data.stream.state_dict())
         self.learner.require_finite()
-        if not self.group.is_first:
-            return
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         state = {
             "learner": self.learner.state_dict(),
-            "streams": streams,
+            "streams": [self.data.stream.state_dict()],
             "datasets": [reader.content_digest for reader in self.data.readers],
             "seconds": self.budget.spent,
         }
         with new_checkpoint(self.output, self.learner.step, state) as folder:
-            shipped = model.without_object_head()
+            shipped = self.learner.averaged.without_object_head()
             save_artifact(folder, shipped, self.config.planner, provenance)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
@@ -321,7 +307,7 @@ class TrainingRun:
         )
 
 
-def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
+def _prepare_output(config: TrainConfig) -> Path:
     """Check packages, sizes and folders before any work starts; returns the output folder."""
     for flag, wanted in (("wandb.enable", config.wandb.enable), ("trackio", config.trackio)):
         if wanted:
@@ -332,8 +318,6 @@ def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
         raise UsageError(f"--policy: {error}; make the networks smaller") from error
     if config.eval_closed_loop:
         require_simulator()
-    if not group.is_first:
-        return Path(config.output_dir)
     output = prepare_output(config.output_dir, config.resume)
     if config.resume:
         require_datasets(config)
@@ -355,16 +339,17 @@ def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
     """Restore the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
-        ArtifactError: the networks have changed.
+        ArtifactError: the networks have changed, or an earlier version trained in several
+            processes.
         DataError: the dataset has changed.
-        UsageError: the windows or the number of processes have changed.
+        UsageError: the windows have changed.
     """
-    state, stream = load_training_state(output), data.stream
+    state = load_training_state(output)
     with restoring(output):
         require_same_content(data.readers, state["datasets"])
         learner.load_state_dict(state["learner"])
-        streams = state["streams"]
-        stream.load_state_dict(streams[min(learner.group.rank, len(streams) - 1)])
+        (stream,) = state["streams"]  # more: an earlier version trained in several processes
+        data.stream.load_state_dict(stream)
         return float(state["seconds"])
 
 

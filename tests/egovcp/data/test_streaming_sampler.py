@@ -1,4 +1,4 @@
-"""Batches from a few episodes at a time: the same contract, bounded, sharded, resumable."""
+"""Batches from a few episodes at a time: the same contract, bounded, resumable."""
 
 import json
 import tracemalloc
@@ -134,8 +134,6 @@ def test_resuming_with_other_options_or_data_is_refused(
     state = StreamingSampler(six, _config(), shuffle=FEW).state_dict()
     with pytest.raises(UsageError, match="episodes 3 -> 4"):
         StreamingSampler(six, _config(), shuffle=ShuffleConfig(4)).load_state_dict(state)
-    with pytest.raises(UsageError, match="ranks 1 -> 2"):
-        StreamingSampler(six, _config(), shuffle=FEW, ranks=2).load_state_dict(state)
     with pytest.raises(DataError, match="episodes have changed"):
         StreamingSampler(six.select(np.arange(5)), _config(), shuffle=FEW).load_state_dict(state)
     store = EpisodeStore.load([reader])
@@ -147,36 +145,7 @@ def test_resuming_with_other_options_or_data_is_refused(
         )
 
 
-# --- several processes, several datasets ------------------------------------------------------
-@pytest.mark.parametrize("ranks", [2, pytest.param(6, marks=pytest.mark.slow)])
-def test_every_rank_yields_its_own_episodes(make_index: MakeIndex, ranks: int) -> None:
-    """Also with fewer files than ranks."""
-    index = make_index(10, 7)
-    drawn: list[set[int]] = []
-    for rank in range(ranks):
-        stream = StreamingSampler(index, _config(), shuffle=FEW, rank=rank, ranks=ranks)
-        drawn.append({e for _ in range(60) for e in next(stream)["episode"].tolist()})
-    assert sum(map(len, drawn)) == len(index)
-    assert set.union(*drawn) == set(range(len(index)))
-
-
-def test_files_stay_whole_where_there_are_enough_of_them(make_index: MakeIndex) -> None:
-    index = make_index(4, 6, 5, 3)
-    datasets = []
-    for rank in range(2):
-        stream = StreamingSampler(index, _config(), shuffle=FEW, rank=rank, ranks=2)
-        drawn = np.concatenate([next(stream)["episode"] for _ in range(60)])
-        datasets.append(set(index.dataset[drawn].tolist()))
-    assert not datasets[0] & datasets[1]
-
-
-def test_too_many_ranks_are_refused(six: EpisodeIndex) -> None:
-    with pytest.raises(UsageError, match="use fewer processes"):
-        StreamingSampler(six, _config(), ranks=7)
-    with pytest.raises(UsageError, match="rank 2 of 2"):
-        StreamingSampler(six, _config(), rank=2, ranks=2)
-
-
+# --- several datasets ------------------------------------------------------------------------
 def test_datasets_are_drawn_by_weight(make_index: MakeIndex) -> None:
     index = make_index(20, 6)
     stream = StreamingSampler(index, _config(batch_size=32), Mix((1.0, 3.0)), ShuffleConfig(8))

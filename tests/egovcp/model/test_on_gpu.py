@@ -1,13 +1,12 @@
 """A gradient step on a GPU is the one of the processor."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import pytest
 import torch
 from torch import Tensor
 
-from egovcp.model import Batch, WorldModel, losses, sample_step_noise, world_model_gradients
+from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
 from egovcp.testing import random_batch, toy_model
 
 pytestmark = [
@@ -16,8 +15,8 @@ pytestmark = [
 ]
 
 
-def _step(model: WorldModel, batch: Batch) -> tuple[dict[str, float], Tensor]:
-    total, terms, _ = world_model_gradients(model, batch, sample_step_noise(model, batch))
+def _step(model: WorldModel, batch: Batch, draws: StepNoise) -> tuple[dict[str, float], Tensor]:
+    total, terms, _ = world_model_gradients(model, batch, draws)
     gradients = [p.grad.flatten().cpu() for p in model.parameters() if p.grad is not None]
     named = {name: float(term) for name, term in {**terms, "total": total}.items()}
     return named, torch.cat(gradients)
@@ -27,19 +26,15 @@ def _step(model: WorldModel, batch: Batch) -> tuple[dict[str, float], Tensor]:
 def test_losses_and_gradients_are_those_of_the_cpu(
     preset: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def same_noise(
-        shape: Sequence[int], generator: torch.Generator | None, device: torch.device
-    ) -> Tensor:
-        return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(0)).to(device)
-
-    monkeypatch.setattr(losses, "row_noise", same_noise)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     model = toy_model(preset).train()
     every = dataclasses.replace(model.config.loss, decode_every=1, multistep_stride=1)
     model.config = dataclasses.replace(model.config, loss=every)
     batch = random_batch(4, 16)
-    expected, gradient = _step(model, batch)
-    found, on_gpu = _step(model.cuda(), Batch(*(x.cuda() for x in batch)))
+    draws = sample_step_noise(model, batch)
+    expected, gradient = _step(model, batch, draws)
+    draws = draws._replace(noise=draws.noise.cuda(), actions=draws.actions.cuda())
+    found, on_gpu = _step(model.cuda(), Batch(*(x.cuda() for x in batch)), draws)
     assert found == pytest.approx(expected, rel=1e-3, abs=1e-4)
     assert on_gpu.shape == gradient.shape
     assert (on_gpu - gradient).norm() < 1e-3 * gradient.norm()
