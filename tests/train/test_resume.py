@@ -304,7 +304,7 @@ def test_a_run_of_several_processes_is_not_resumed(
     output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
     state = load_training_state(output)
     _replace_state(output, {**state, "streams": 2 * state["streams"]})
-    _refused([f"--output_dir={output}", "--resume"], 4, capsys, "too many values")
+    _refused([f"--output_dir={output}", "--resume"], 4, capsys, "was trained in 2 processes")
 
 
 def _replace_state(output: Path, state: dict[str, object]) -> None:

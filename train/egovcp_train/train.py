@@ -17,7 +17,7 @@ from tqdm import tqdm
 from egovcp.artifact import save_artifact
 from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.errors import UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
@@ -348,8 +348,13 @@ def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
     with restoring(output):
         require_same_content(data.readers, state["datasets"])
         learner.load_state_dict(state["learner"])
-        (stream,) = state["streams"]  # more: an earlier version trained in several processes
-        data.stream.load_state_dict(stream)
+        streams = state["streams"]  # a list, because earlier versions had one for each process
+        if len(streams) > 1:
+            raise ArtifactError(
+                f"{output} was trained in {len(streams)} processes by an earlier version; expected "
+                "one: start a new run, with --policy.pretrained_path to begin from its policy"
+            )
+        data.stream.load_state_dict(streams[0])
         return float(state["seconds"])
 
 
