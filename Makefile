@@ -32,7 +32,7 @@ install: .venv/installed
 	@touch $@
 
 test: install
-	pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder -m "not slow and not gpu"
+	pytest --numprocesses=$(WORKERS) --max-worker-restart=1 --dist=loadfile --no-loadscope-reorder -m "not slow and not gpu"
 
 demo: install
 	rm -rf outputs/demo

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: tests are many and small
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -24,6 +25,14 @@ def interrupt_handler() -> Iterator[None]:
     handler = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, handler)
+
+
+@pytest.fixture(autouse=True)
+def computing_threads() -> Iterator[None]:
+    """Restore the number of torch's threads, which commands set for their process."""
+    yield
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
 @pytest.fixture
