@@ -19,18 +19,18 @@ from tests.support.hub import FakeHub, in_this_process
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+_SCHEDULING = os.sched_getscheduler(0), os.sched_getparam(0)
+
+
 @pytest.fixture(autouse=True)
-def interrupt_handler() -> Iterator[None]:
-    """Restore the handler of Ctrl-C, which commands replace."""
+def process_settings() -> Iterator[None]:
+    """Restore what a test may change in its process: the handler of Ctrl-C and the number of
+    torch's threads, which commands set; and scheduling, because root's SVT-AV1 gives the thread that
+    encodes a video real-time priority for good, and others starve."""
     handler = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, handler)
-
-
-@pytest.fixture(autouse=True)
-def computing_threads() -> Iterator[None]:
-    """Restore the number of torch's threads, which commands set for their process."""
-    yield
+    os.sched_setscheduler(0, *_SCHEDULING)
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
