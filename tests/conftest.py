@@ -24,9 +24,11 @@ _SCHEDULING = os.sched_getscheduler(0), os.sched_getparam(0)
 
 @pytest.fixture(autouse=True)
 def process_settings() -> Iterator[None]:
-    """Restore what a test may change in its process: the handler of Ctrl-C and the number of
-    torch's threads, which commands set; and scheduling, because root's SVT-AV1 gives the thread that
-    encodes a video real-time priority for good, and others starve."""
+    """Restore what a test may change in its process.
+
+    Commands set the handler of Ctrl-C and the number of torch's threads. As root, SVT-AV1 gives a
+    thread that encodes a video real-time priority for good, and other threads starve.
+    """
     handler = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, handler)
