@@ -77,6 +77,8 @@ class PlannerConfig:
     """icem: share of the elites that are candidates again in the next iteration."""
     sample_decay: float = bounded(1.25, least=1, most=1000)
     """icem: factor by which the number of samples shrinks per iteration."""
+    mirror: bool = True
+    """If the robot is symmetric, average J with that of the mirrored plan in the mirrored scene."""
     backend: BackendName = "auto"
     """eager: the world model itself; float32: packed networks; int8: 8-bit integers, by a library
     compiled on first use (CPU only); auto: int8 on CPUs where it is fast, else float32."""
@@ -92,7 +94,8 @@ class PlannerConfig:
         return self.horizon + (self.objective == "td")
 
 
-#: The paper's planner: 1024 random walks, 64 elites, no action costs, value 0 after a termination.
+#: The paper's planner: 1024 random walks, 64 elites, no action costs, value 0 after a termination,
+#: no mirrored plans.
 PAPER_PLANNER = PlannerConfig(
     samples=1024,
     elites=64,
@@ -100,6 +103,7 @@ PAPER_PLANNER = PlannerConfig(
     action_rate_cost=0.0,
     action_parameterization="random_walk",
     termination_rule="paper",
+    mirror=False,
 )
 
 
@@ -120,14 +124,15 @@ def require_compatible(model: WorldModelConfig, planner: PlannerConfig) -> None:
 
 def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
     """Raise `UsageError` if a plan for one robot, on one core, takes too much time or memory."""
-    samples, iterations, actions = planner.samples, planner.iterations, planner.actions
+    samples = planner.samples * (1 + planner.mirror)
+    iterations, actions = planner.iterations, planner.actions
     floats = _floats_per_step(model)
     per_step = _products_per_step(model) / _PRODUCTS_PER_S + floats / _FLOATS_PER_S
     seconds = samples * actions * iterations * per_step + actions * iterations * _CALL_S
     memory = _BYTES * samples * (actions * spec.ACTION_DIM * _ACTION_COPIES + floats)
     if seconds > MAX_SECONDS or memory > MAX_BYTES:
         raise UsageError(
-            f"planner.samples={samples}, planner.horizon={planner.horizon} and "
+            f"planner.samples={planner.samples}, planner.horizon={planner.horizon} and "
             f"planner.iterations={iterations} take about {seconds:,.1f} s on one core and "
             f"{memory / 1e6:,.0f} MB for each plan of one robot with these networks; expected at "
             f"most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower them"

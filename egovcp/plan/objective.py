@@ -17,7 +17,9 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from egovcp.model import Carry
 from egovcp.plan.config import PlannerConfig
+from egovcp.robot_spec import RobotSpec
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
 """J (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
@@ -72,6 +74,34 @@ class ReferenceEvaluator[L](NamedTuple):
 
         def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             return evaluate(self.model, carry, actions, self.config, generator)
+
+        return plan_value
+
+
+def mirrored_actions(actions: Tensor, robot: RobotSpec) -> Tensor:
+    """Reflected normalised actions (..., 7) of a symmetric robot."""
+    assert robot.mirror is not None, "the robot is not symmetric"
+    sign = torch.tensor(robot.mirror.action_sign, device=actions.device)
+    return actions[..., list(robot.mirror.action_source)] * sign
+
+
+class MirroredEvaluator(NamedTuple):
+    """Mean J of a plan and of its mirror image in the mirrored scene, which are equal in truth.
+
+    The errors of Q in the two are partly independent, and their difference is gone. States come in
+    pairs, (2 E, ...): those of E robots, then the same robots as seen in a mirror.
+    """
+
+    evaluator: PlanEvaluator[Carry]
+    robot: RobotSpec
+
+    def at(self, carry: Carry) -> PlanValue:
+        """See `PlanEvaluator`; plans are those of the E robots."""
+        value_of_both = self.evaluator.at(carry)
+
+        def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
+            both = torch.cat([actions, mirrored_actions(actions, self.robot)])
+            return value_of_both(both, generator).view(2, len(actions), -1).mean(0)
 
         return plan_value
 

@@ -15,7 +15,7 @@ from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import PlanEvaluator
+from egovcp.plan.objective import MirroredEvaluator, PlanEvaluator, mirrored_actions
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.search import make_plan, shift
 from egovcp.robot_spec import G1, RobotSpec
@@ -51,6 +51,9 @@ class Policy:
     The recurrence advances with the action that was sent, after the safety layer: pass it to
     `advance`. The model's weights are packed at the first plan; later changes are not seen. Shapes
     below are the G1's; those of another robot are in the model's `RobotSpec`.
+
+    Under ``mirror``, the mirrored observations of a symmetric robot are filtered, too, and plans
+    are evaluated from both states (`MirroredEvaluator`).
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class Policy:
         self.model = model.eval()
         self.config = config
         self.num_envs = num_envs
+        self._views = 2 if config.mirror and model.robot.mirror else 1
         self._seed = seed
         self._evaluator: PlanEvaluator[Carry] | None = None
         self.skipped: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
@@ -71,7 +75,7 @@ class Policy:
         if rows is None:
             device, envs = self._device, self.num_envs
             actions = self.model.robot.action_dim
-            self._carry = self.model.initial(envs)
+            self._carry = self.model.initial(self._views * envs)  # the mirrored states follow
             self._sent = torch.zeros(envs, actions, device=device)
             self._first = torch.ones(envs, dtype=torch.bool, device=device)
             self._warm = torch.zeros(envs, self.config.actions, actions, device=device)
@@ -93,29 +97,40 @@ class Policy:
         if np.issubdtype(depth.dtype, np.floating):
             depth = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
         valid = (np.abs(state) <= LARGEST_STATE).all(1)  # false for NaN
+        depth = depth.astype(np.int32)
+        state = np.where(valid[:, None], state, 0.0).astype(np.float32)
+        if self._views > 1:
+            depth = np.concatenate([depth, depth[..., ::-1]])
+            state = np.concatenate([state, self.model.robot.mirrored_state(state)])
         before, first = self._carry, self._first
         observed = self.model.observe(
             before,
-            self._sent,
-            torch.from_numpy(depth.astype(np.int32)).to(self._device),
-            torch.as_tensor(
-                np.where(valid[:, None], state, 0.0), dtype=torch.float32, device=self._device
-            ),
-            first,
+            self._sent_views(),
+            torch.from_numpy(depth).to(self._device),
+            torch.from_numpy(state).to(self._device),
+            first.repeat(self._views),
         )
-        usable = torch.from_numpy(valid).to(self._device) & _finite_rows(observed)
+        finite = _finite_rows(observed).view(self._views, -1).all(0)
+        usable = torch.from_numpy(valid).to(self._device) & finite
         if bool(usable.all()):
             self._carry, self._first = observed, torch.zeros_like(first)
         else:
             predicted = self._predicted(before, first)
-            self._carry = _choose_rows(usable, observed, predicted)
+            self._carry = _choose_rows(usable.repeat(self._views), observed, predicted)
             self._first = first & ~usable  # it starts at the first usable observation
         self.skipped = ~usable.cpu().numpy()
 
     def _predicted(self, carry: Carry, first: Tensor) -> Carry:
         """The carry at this step without its observation; from zeros where ``first`` (E,)."""
-        start = _choose_rows(first, self.model.initial(self.num_envs), carry)
-        return self.model.imagine(start, self._sent.masked_fill(first[:, None], 0.0))
+        first = first.repeat(self._views)
+        start = _choose_rows(first, self.model.initial(len(first)), carry)
+        return self.model.imagine(start, self._sent_views().masked_fill(first[:, None], 0.0))
+
+    def _sent_views(self) -> Tensor:
+        """The last action that was sent, and its mirror image if that is used, (views E, 7)."""
+        if self._views == 1:
+            return self._sent
+        return torch.cat([self._sent, mirrored_actions(self._sent, self.model.robot)])
 
     def _check_shapes(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         expected = (
@@ -144,8 +159,11 @@ class Policy:
                 many iterations as fit, at least one. None: all of them.
         """
         self.observe(depth, state)
+        evaluator = self.prepare()
+        if self._views > 1:
+            evaluator = MirroredEvaluator(evaluator, self.model.robot)
         plan = make_plan(
-            self.prepare(),
+            evaluator,
             optimiser_of(self.config, self._device),
             self._carry,
             self._sent,
@@ -159,7 +177,7 @@ class Policy:
             _numpy(plan.actions[:, 0]).copy(),
             _numpy(plan.actions),
             _numpy(plan.value),
-            _numpy(self.model.termination(self._carry)),
+            _numpy(self.model.termination(self.carry)),
             _numpy(plan.candidates),
             _numpy(plan.candidate_values),
             plan.iterations,
@@ -194,13 +212,13 @@ class Policy:
 
     @property
     def carry(self) -> Carry:
-        """The filtered state, for probes and logs; without gradients."""
-        return self._carry
+        """The filtered state (E, ...), for probes and logs; without gradients."""
+        return self._carry.map(lambda x: x[: self.num_envs])
 
     @torch.inference_mode()
     def reconstruct(self) -> Array:
         """Depth (E, 48, 64) in metres decoded from the filtered state; 0 = invalid."""
-        return _numpy(self.model.decode(self._carry)[0])
+        return _numpy(self.model.decode(self.carry)[0])
 
     @torch.inference_mode()
     def imagine(self, plan: NDArray[np.floating], horizon: int) -> Array:
@@ -209,7 +227,7 @@ class Policy:
         Beyond the plan's end its last action is held.
         """
         actions = torch.as_tensor(plan, dtype=torch.float32, device=self._device)
-        carry, path = self._carry, list[Carry]()
+        carry, path = self.carry, list[Carry]()
         for k in range(horizon):
             carry = self.model.imagine(carry, actions[:, min(k, actions.shape[1] - 1)])
             path.append(carry)

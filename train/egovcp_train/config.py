@@ -63,7 +63,8 @@ class SamplingConfig:
     burn_in: int = bounded(0, least=0, most=100_000)
     """Leading ticks of a window that only fill the memory and are not trained on."""
     mirror: bool = True
-    """Mirror half of the windows left to right (data augmentation)."""
+    """Mirror half of the windows left to right (data augmentation); without it, the planner
+    evaluates no mirrored plans."""
     tasks: dict[str, float] = field(default_factory=dict)
     """Sampling weight per task relative to uniform sampling, '{ball: 2, wall: 1}'; 1 for tasks not
     listed."""
@@ -209,6 +210,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
+        if not self.sampling.mirror:
+            object.__setattr__(self, "planner", replace(self.planner, mirror=False))
         require_compatible(self.policy, self.planner)
         require_affordable(self.policy, self.planner)
         for term in spec.ACTION_TERMS:
