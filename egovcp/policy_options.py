@@ -67,6 +67,8 @@ class PlannerOptions:
     """z of imagined states: mean or sample of the prior."""
     optimiser: OptimiserName | None = None
     """Optimiser: cem, icem, mppi or shooting."""
+    mirror: bool | None = None
+    """Average J with that of the mirrored plan in the mirrored scene, if the robot is symmetric."""
     backend: BackendName | None = None
     """Implementation of the networks: auto, eager, float32 or int8."""
 
