@@ -86,10 +86,10 @@ def mirrored_actions(actions: Tensor, robot: RobotSpec) -> Tensor:
 
 
 class MirroredEvaluator(NamedTuple):
-    """Mean J of a plan and of its mirror image in the mirrored scene, which are equal in truth.
+    """J of a plan, averaged with that of its mirror image in the mirrored scene.
 
-    The errors of Q in the two are partly independent, and their difference is gone. States come in
-    pairs, (2 E, ...): those of E robots, then the same robots as seen in a mirror.
+    The true values are equal, and the errors of Q partly independent, so the mean has less error.
+    States are (2 E, ...): those of E robots, then of the same robots as seen in a mirror.
     """
 
     evaluator: PlanEvaluator[Carry]
