@@ -13,13 +13,15 @@ from egovcp_experiment.report import ExperimentReport, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
 
 #: Rule -> flags of egovcp-eval; the search is the policy's own. ``default`` has
-#: termination_rule=shift and action_parameterization=target, unless it was trained with others.
+#: termination_rule=shift, action_parameterization=target and mirror=true, unless it was trained
+#: with others.
 RULES: Final[dict[str, Flags]] = {
     "default": {},
     "rule_paper": {"planner.termination_rule": "paper"},
     "rule_survival": {"planner.termination_rule": "survival"},
     "random_walk": {"planner.action_parameterization": "random_walk"},
     "latent_sample": {"planner.latent": "sample"},
+    "one_view": {"planner.mirror": False},
 }
 
 
