@@ -16,7 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo         install, then let the policy that ships with egovcp play all tasks (1 min)"
-	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (15 min)"
+	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (about 15 min)"
 	@echo "make test         the test suite"
 	@echo "make check        linter, formatter, type checker, lock file, docs"
 	@echo "make docs         the documentation site, in site/"

@@ -96,6 +96,11 @@ def test_a_mirrored_window_of_lerobot_is_a_mirrored_window_of_the_stream(
         np.testing.assert_array_equal(value[valid], expected[name][valid], err_msg=name)
 
 
+@pytest.mark.parametrize("mirror", [True, False])
+def test_only_a_model_of_mirrored_windows_plans_in_a_mirror(mirror: bool) -> None:
+    assert EgovcpConfig(mirror=mirror).planner.mirror == mirror
+
+
 def test_mirrored_windows_are_for_learning_alone(
     policy: EgovcpPolicy,
     config: EgovcpConfig,

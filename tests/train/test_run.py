@@ -361,6 +361,11 @@ def test_the_controller_of_the_data_goes_into_the_artifact(
     assert load_artifact(str(folder)).controller_id == "walker-7"
 
 
+@pytest.mark.parametrize("mirror", [True, False])
+def test_only_a_model_of_mirrored_windows_plans_in_a_mirror(mirror: bool) -> None:
+    assert _parsed(f"--sampling.mirror={mirror}").planner.mirror == mirror
+
+
 def test_paper_preset_sets_the_options_of_the_paper_outside_the_world_model_too() -> None:
     """A single flag still overrides it."""
     config = _parsed("--preset=paper", "--planner.samples=64", "--optimizer.lr=0.01")

@@ -210,7 +210,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
-        if not self.sampling.mirror:
+        if not self.sampling.mirror:  # the model has seen no mirrored scenes
             object.__setattr__(self, "planner", replace(self.planner, mirror=False))
         require_compatible(self.policy, self.planner)
         require_affordable(self.policy, self.planner)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -47,7 +47,8 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     sequence_length: int = 20
     """Ticks per training window, which begins at the row that LeRobot draws."""
     mirror: bool = True
-    """Left-right mirror half of the windows (the robot is symmetric)."""
+    """Left-right mirror half of the windows (the robot is symmetric); without it, the planner
+    evaluates no mirrored plans."""
     drop_n_last_frames: int = 0
     """Rows at the end of an episode at which no window begins. Windows are padded at the end."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_no_normalisation)
@@ -71,6 +72,8 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 f"{self.drop_n_last_frames}; expected at least 2 and 0"
             )
         self.returns.check("--policy.returns")
+        if not self.mirror:  # the model has seen no mirrored scenes
+            self.planner = replace(self.planner, mirror=False)
         require_compatible(self.world_model, self.planner)
         require_affordable(self.world_model, self.planner)
         self._check_losses()

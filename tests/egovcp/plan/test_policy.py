@@ -415,7 +415,7 @@ def _mirrored(sight: Sight) -> Sight:
     return Sight(sight.depth[..., ::-1].copy(), G1.mirrored_state(sight.state))
 
 
-def test_a_plan_is_worth_the_same_in_a_mirror() -> None:
+def test_a_plan_has_the_same_value_in_a_mirror() -> None:
     """Of an untrained model, whose Q is not symmetric at all."""
     policy, other = (Policy(toy_model(), PlannerConfig(), 3) for _ in range(2))
     sent = np.random.default_rng(0).uniform(-1, 1, (3, A)).astype(np.float32)
@@ -432,6 +432,14 @@ def test_a_plan_is_worth_the_same_in_a_mirror() -> None:
     torch.testing.assert_close(found, expected)
     one_view = policy.prepare().at(policy.carry)(plans, None)
     assert (one_view - found).abs().max() > 1e-3
+
+
+def test_a_policy_plans_with_both_views_by_default() -> None:
+    config = plain_planner(samples=64, elites=8, iterations=2, mirror=False)
+    one_view = _run(Policy(toy_model(), config, 2), 3)
+    both = _run(Policy(toy_model(), dataclasses.replace(config, mirror=True), 2), 3)
+    assert not np.allclose(one_view[-1].plan, both[-1].plan)
+    assert PlannerConfig().mirror
 
 
 @pytest.mark.parametrize("mirror", [True, False])
