@@ -52,6 +52,17 @@ class DataError(EgovcpError):
         error.problem, error.file, error.episode, error.frame = problem, str(file), episode, frame
         return error
 
+    @classmethod
+    def without_place(cls, problem: str) -> Self:
+        """An error whose place the caller adds."""
+        error = cls(problem)
+        error.problem = problem
+        return error
+
+
+class SchemaError(DataError):
+    """A column is missing or differs from its feature in ``meta/info.json``."""
+
 
 class SimulationDiverged(DataError):
     """The physics of an episode diverged; the episode is not valid data."""

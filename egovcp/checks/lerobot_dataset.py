@@ -23,22 +23,24 @@ from egovcp.checks.feature_statistics import (
     describe,
     statistics_problems,
 )
+from egovcp.checks.lerobot_episode import (
+    check_images,
+    check_size,
+    first_difference,
+    span_problem,
+    value_problems,
+)
 from egovcp.data import schema
-from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader, values_of
 from egovcp.data.paths import files_below, require_file
-from egovcp.data.pictures import decode_frames, decode_image, frame_times
+from egovcp.data.pictures import decode_frames, frame_times
 from egovcp.data.stats import aggregate_named
-from egovcp.errors import DataError
+from egovcp.errors import DataError, SchemaError
 
 type Progress = Callable[[int, int], None]
-type Problem = tuple[int | None, str]
-"""First frame at fault, or None; the problem."""
 
 #: LeRobot's editing tools copy these statistics unchanged from the source dataset.
 STALE: Final = ("index", "episode_index", "task_index")
-#: LeRobot's default `tolerance_s`: a frame farther from its timestamp raises an error.
-TOLERANCE_S: Final = 1e-4
-_FLOAT32: Final = 2.0**-22  # relative error of a float32 timestamp
 _RANGE: Final = re.compile(r"(\d{1,18}):(\d{1,18})", re.ASCII)
 
 
@@ -63,8 +65,8 @@ def lerobot_problems(
 
 class LeRobotCheck:
     """The checks of one dataset; call `table_problems`, then `file_problems` of every data file in
-    order, then `total_problems`. A wrong shape or a missing column is reported once for each file,
-    or, if ``every``, for each episode."""
+    order, then `total_problems`. A `SchemaError` is reported once for each file and feature, or, if
+    ``every``, for each episode."""
 
     def __init__(self, reader: LeRobotReader, every: bool = False) -> None:
         self.reader, self._every = reader, every
@@ -74,7 +76,7 @@ class LeRobotCheck:
             self.by_number.setdefault(row.index, row)
         self._seen: dict[int, Path] = {}
         self._frames = 0
-        self._shapes: set[tuple[Path, str]] = set()
+        self._reported: set[tuple[Path, str]] = set()
         self._sums: dict[str, list[tuple[int, Statistics]]] = {}
         self._valid_frames = 0
         self._has_av = importlib.util.find_spec("av") is not None
@@ -218,18 +220,19 @@ class LeRobotCheck:
                 continue
             try:
                 if key not in table.column_names:
-                    raise _without_place(f"lacks the column {key} of {schema.INFO_PATH}")
+                    raise SchemaError.without_place(f"lacks the column {key} of {schema.INFO_PATH}")
                 if feature.dtype == "image":
-                    _check_images(table[key], feature)
+                    check_images(table[key], feature)
                     continue
                 values[key] = values_of(table[key], feature)
             except DataError as error:
                 problems += 1
-                of_file = "shape" in error.problem or "column" in error.problem
-                if self._every or not of_file or (path, key) not in self._shapes:
+                of_file = isinstance(error, SchemaError) and not self._every
+                if not of_file or (path, key) not in self._reported:
                     yield DataError.at(path, error.problem, number, error.frame)
-                self._shapes.add((path, key))
-        for frame, problem in _value_problems(values, self.reader):
+                if of_file:
+                    self._reported.add((path, key))
+        for frame, problem in value_problems(values, self.reader):
             problems += 1
             yield DataError.at(path, problem, number, frame)
         row = self.by_number.get(number)
@@ -248,14 +251,14 @@ class LeRobotCheck:
             try:
                 require_file(self.reader.root, path)
                 shown = self._times(path)
-                frame, problem = _span_problem(shown, span.start_s + times)
+                frame, problem = span_problem(shown, span.start_s + times)
                 if not problem:
                     near = np.abs(shown[:, None] - (span.start_s + times[[0, -1]])).argmin(0)
                     for at in near.tolist():
                         image = next(decode_frames(path, [shown[at]]), None)
                         if image is None:
                             raise DataError.at(path, "the video is damaged: a frame is unreadable")
-                        _check_size((image.width, image.height), self.reader.features[key])
+                        check_size((image.width, image.height), self.reader.features[key])
             except DataError as error:
                 problem = error.problem or str(error)
             if problem:
@@ -289,7 +292,7 @@ class LeRobotCheck:
         if values is None:
             return
         self._valid_frames += len(table)
-        at = _first_difference(values["index"][:, 0], first + np.arange(len(table)))
+        at = first_difference(values["index"][:, 0], first + np.arange(len(table)))
         if at is not None:
             yield DataError.at(path, f"column index does not count from {first}", number, at)
         for key, feature in self.reader.features.items():
@@ -333,94 +336,3 @@ def _lost(episodes: list[int]) -> str:
         return ""
     first, last = min(episodes), max(episodes)
     return f" (episode {first})" if first == last else f" (episodes {first} to {last})"
-
-
-def _value_problems(values: Mapping[str, NDArray[Any]], reader: LeRobotReader) -> Iterator[Problem]:
-    for key, array in values.items():
-        if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
-            at = int(np.argmin(finite.all(1)))
-            label = reader.features[key].label(int(np.argmin(finite[at])))
-            yield at, f"{label} is {array[at][~finite[at]][0]}, expected a finite number"
-    if "frame_index" in values:
-        found = values["frame_index"][:, 0]
-        at_frame = _first_difference(found, np.arange(len(found)))
-        if at_frame is not None:
-            problem = f"frame_index is {found[at_frame]}, expected {at_frame}"
-            yield at_frame, f"{problem}: a frame is missing, repeated, or of another episode"
-    if "timestamp" in values:
-        times = values["timestamp"][:, 0].astype(np.float64)
-        yield from _time_problems(times, reader.fps, bool(reader.keys("video")))
-    if "task_index" in values and reader.tasks:
-        known = np.isin(values["task_index"][:, 0], list(reader.tasks))
-        if not known.all():
-            at = int(np.argmin(known))
-            index = values["task_index"][at, 0]
-            yield at, f"task_index {index} is not in {schema.TASKS_PATH}, which has no text for it"
-
-
-def _time_problems(times: NDArray[np.float64], fps: float, has_videos: bool) -> Iterator[Problem]:
-    expected = np.arange(len(times)) / fps
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if len(back):
-        at = int(back[0]) + 1
-        yield at, f"timestamp {times[at]:g} s follows {times[at - 1]:g} s; timestamps must increase"
-        return
-    off = np.abs(times - expected)
-    late = np.flatnonzero(off > TOLERANCE_S + _FLOAT32 * expected)
-    if len(late) and has_videos:
-        at = int(late[0])
-        problem = f"timestamp {times[at]:g} s, expected {expected[at]:g} at {fps:g} fps"
-        yield at, f"{problem}; LeRobot does not find its video frame"
-
-
-def _span_problem(
-    shown: NDArray[np.float64], wanted: NDArray[np.float64]
-) -> tuple[int | None, str]:
-    """The first of the times ``wanted`` (T,) that a video with frame times (F,) does not show."""
-    if not len(shown):
-        return None, "the video has no frame"
-    right = np.clip(np.searchsorted(shown, wanted), 1, max(len(shown) - 1, 1))
-    pair = np.stack([shown[right - 1], shown[np.minimum(right, len(shown) - 1)]])
-    distance = np.abs(pair - wanted).min(0)
-    far = np.flatnonzero(distance > TOLERANCE_S + _FLOAT32 * wanted)
-    if not len(far):
-        return None, ""
-    at = int(far[0])
-    if wanted[at] > shown[-1]:
-        missing = int((wanted > shown[-1] + TOLERANCE_S).sum())
-        end = f"the video ends at {shown[-1]:g} s after {len(shown)} frames"
-        return at, f"{end}; {missing} of the episode's {len(wanted)} frames are missing"
-    return at, (
-        f"no video frame within {TOLERANCE_S * 1e3:g} ms of {wanted[at]:.5f} s, the nearest is "
-        f"{distance[at] * 1e3:.3g} ms away; LeRobot raises FrameTimestampError"
-    )
-
-
-def _check_images(column: pa.ChunkedArray, feature: Feature) -> None:
-    for frame, content in enumerate(value.as_py() for value in column):
-        image = decode_image(content, frame, feature.key)
-        try:
-            _check_size(image.size, feature)
-        except DataError as error:
-            error.frame = frame
-            raise
-
-
-def _check_size(size: tuple[int, int], feature: Feature) -> None:
-    """Raise `DataError` if a picture (width, height) has not the shape of its feature, which may
-    have the channels first or last."""
-    width, height = size
-    if (height, width) not in (feature.shape[:2], feature.shape[-2:]):
-        shape = list(feature.shape)
-        raise _without_place(f"{feature.key} is {height}x{width}, but its shape is {shape}")
-
-
-def _without_place(problem: str) -> DataError:
-    error = DataError(problem)
-    error.problem = problem
-    return error
-
-
-def _first_difference(found: NDArray[Any], expected: NDArray[Any]) -> int | None:
-    wrong = np.flatnonzero(found != expected)
-    return int(wrong[0]) if len(wrong) else None

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from egovcp.data import metadata, schema, tiff
 from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import files_below, require_file
-from egovcp.errors import DataError
+from egovcp.errors import DataError, SchemaError
 
 _TABLE_COLUMNS: Final = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
 _DATA_PLACE: Final = ("data/chunk_index", "data/file_index")
@@ -338,7 +338,8 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
     """The column of a feature that is no camera as (T, n), n values per frame.
 
     Raises:
-        DataError: with `frame` set, a value is missing or the shape differs from the feature's.
+        DataError: with `frame` set, a value is missing.
+        SchemaError: with `frame` set, shape or type differs from the feature's.
     """
     array = column.combine_chunks()
     if isinstance(array, pa.ChunkedArray):
@@ -358,13 +359,15 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
             at = int(np.argmax(sizes != want))
             given = f"{sizes[at]} values" if not levels else f"{sizes[at]} values at level {levels}"
             problem = f"{key} has {given}, but {schema.INFO_PATH} gives its shape as "
-            raise tiff.frame_error(at // per_frame, problem + str(list(feature.shape)))
+            problem += str(list(feature.shape))
+            raise tiff.frame_error(at // per_frame, problem, SchemaError)
         per_frame, levels, array = per_frame * want, levels + 1, array.flatten()
     if levels != len(feature.shape) and (levels, feature.size) != (0, 1):
         problem = f"{key} holds single values, but its shape is {list(feature.shape)}"
-        raise tiff.frame_error(0, problem)
+        raise tiff.frame_error(0, problem, SchemaError)
     if _kind(array.type) != _kind_of(feature.dtype):
-        raise tiff.frame_error(0, f"{key} holds {array.type}, but its dtype is {feature.dtype}")
+        problem = f"{key} holds {array.type}, but its dtype is {feature.dtype}"
+        raise tiff.frame_error(0, problem, SchemaError)
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(frames, per_frame)
 
 

@@ -114,8 +114,8 @@ def open_image(
         raise frame_error(frame, f"{name} is not {kind} that can be read: {reason}") from error
 
 
-def frame_error(frame: int, problem: str) -> DataError:
+def frame_error(frame: int, problem: str, kind: type[DataError] = DataError) -> DataError:
     """An error of one frame of an episode."""
-    error = DataError(f"frame {frame}: {problem}")
+    error = kind(f"frame {frame}: {problem}")
     error.frame, error.problem = frame, problem
     return error
