@@ -78,4 +78,5 @@ def check_options(config: DeployConfig) -> None:
         find_task(config.task, "--task")
     if config.robot.camera.type == "realsense":
         require_realsense()
-    check_output_dir(config.output_dir)
+    if config.output_dir or not config.dry_run:  # a dry run writes nothing
+        check_output_dir(config.output_dir)

@@ -101,8 +101,9 @@ def look(
 ) -> Look:
     """``look(change, ...)``: a dry run before a fake robot; exit code and line per check.
 
-    The limits of the connection are those of a busy machine.
+    The limits of the connection are those of a busy machine. The working folder is ``tmp_path``.
     """
+    monkeypatch.chdir(tmp_path)
     limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MAX_LOST": 0.95, "LISTEN_S": 1.5}
     for name, value in limits.items():
         monkeypatch.setattr(f"egovcp_deploy.dry_run.{name}", value)
@@ -119,7 +120,6 @@ def look(
                 [
                     *("--dry_run=true", "--robot.type=unitree_g1", "--robot.controller=stance"),
                     f"--policy.path={artifact_dir}",
-                    f"--output_dir={tmp_path / 'run'}",
                     f"--robot.bridge.state_port={fake.ports.state_port}",
                     f"--robot.bridge.command_port={fake.ports.command_port}",
                     f"--robot.camera.server.port={fake.ports.camera_port}",
@@ -150,6 +150,14 @@ def test_a_healthy_robot_is_go_in_every_line(look: Look) -> None:
     assert "mode machine 5: 29 joints, waist free" in lines["mode"]
     assert "casing 35 deg C, winding 35 deg C" in lines["motors"]
     assert "when they arrive" in lines["image age"]
+
+
+def test_it_needs_no_output_dir_and_writes_nothing(look: Look, tmp_path: Path) -> None:
+    before = sorted(tmp_path.iterdir())
+    code, lines = look(lambda fake: None)
+    assert code != 2
+    assert "images" in lines
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_hot_motor_is_a_no_go_and_named(look: Look) -> None:
