@@ -1,9 +1,9 @@
 """Accuracy of the planner backends on recorded states, with a trained policy.
 
 Every backend plans from states of recorded episodes, with the draws of the step-by-step float32
-reference. Figures: the change of the first action, in the action box of [-1, 1], and the loss of J
+reference. Metrics: the change of the first action, in the action box of [-1, 1], and the loss of J
 by the reference, in standard deviations of J among the candidates of a first iteration.
-`other_draws` are the same figures of the reference itself with other random draws.
+`other_draws` are the same metrics of the reference itself with other random draws.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def main() -> None:
     p.add_argument("--episodes", type=int, default=20, help="the last ones of the dataset")
     p.add_argument("--every", type=int, default=4, help="a state of every so many rows")
     p.add_argument("--samples", type=int, default=1024, help="M")
-    p.add_argument("--json", type=Path, help="also write the figures to this file")
+    p.add_argument("--json", type=Path, help="also write the metrics to this file")
     args = p.parse_args()
     model = load_artifact(args.policy).world_model.requires_grad_(False)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))

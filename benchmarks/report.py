@@ -42,14 +42,14 @@ def parser(description: str | None, rounds: int | None = 15) -> argparse.Argumen
     p = argparse.ArgumentParser(
         description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    p.add_argument("--json", type=Path, help="also write the figures to this file")
+    p.add_argument("--json", type=Path, help="also write the metrics to this file")
     if rounds is not None:
         p.add_argument("--rounds", type=int, default=rounds, help="measurements of each case")
     return p
 
 
 def publish(figures: dict[str, object], path: Path | None) -> None:
-    """Print the figures, one per line, and write them as JSON where asked."""
+    """Print the metrics, one per line, and write them as JSON where asked."""
     figures = {**figures, **hardware()}
     width = max(map(len, figures))
     for name, value in figures.items():

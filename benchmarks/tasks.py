@@ -1,13 +1,13 @@
 """Difficulty of the tasks for a low-level controller: success and reward of reference policies.
 
 Plays held-out scenarios of each task with `hold` (neutral pose), `constant` (the best fixed action,
-searched on other scenarios), `random` (the paper's random walk) and `oracle`, both bands of the
-arch's clearance among them, and the wall at one push speed after another with `hold` and `oracle`.
-Prints success and reward per step with 95 % intervals, falls, and the way: 0 % is the reward of
-`random`, 100 % that of `oracle`. The last line says for which pushes hands at rest mostly fail and
-the oracle almost always succeeds. For the wall it also prints how often the oracle stands with free
-hands after the push. Run it whenever the controller changes, and put the range of pushes into
-`egovcp.sim.config`:
+searched on other scenarios), `random` (the paper's random walk) and `oracle`: the arch at two
+ranges of clearance, and the wall also at each of `--pushes` with `hold` and `oracle`. Prints
+success and reward per step with 95 % intervals, falls, and the normalized reward (norm.): 0 % is
+that of `random`, 100 % that of `oracle`. The last line lists the push speeds where `hold` succeeds
+in at most 20 % and `oracle` in at least 90 %. For the wall it also prints how often the oracle
+stands with free hands after the push. Run it whenever the low-level controller changes, and set
+`push_speed_range` in `egovcp.sim.tasks.wall`:
 
     python benchmarks/tasks.py
     python benchmarks/tasks.py --tasks ball arch wall --pushes
@@ -35,17 +35,18 @@ from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore, eval_scores
 
-PLAYERS = ("hold", "constant", "random", "oracle")
-PUSHED = ("hold", "oracle")  # for the wall at one push speed after another
-BANDS = {"default": (1.16, 1.24), "low": (1.08, 1.16)}
-MOST_AT_REST, LEAST_BY_ORACLE = 0.2, 0.9
+TASKS = ("ball", "arch", "wall")
+CONTROLLERS = ("hold", "constant", "random", "oracle")
+SWEEP_CONTROLLERS = ("hold", "oracle")  # of the wall at each push speed
+LOW_CLEARANCE = (1.08, 1.16)  # m, of the arch
+MAX_HOLD, MIN_ORACLE = 0.2, 0.9  # success at the push speeds that the last line lists
 ENVS = 10
 RELEASE_S, NEUTRAL_M = 2.0, 0.10
 
 
 @dataclass(frozen=True)
 class Result:
-    """Scores of one player on one task."""
+    """Scores of one controller on one task."""
 
     success: float
     success_ci95: Interval
@@ -59,7 +60,7 @@ class Result:
 
 
 def result(scores: Sequence[EpisodeScore], action: Action = ()) -> Result:
-    """The figures of a player's episodes."""
+    """The metrics of a controller's episodes."""
     found = eval_scores(scores)
     return Result(
         success=found.success_rate,
@@ -72,9 +73,9 @@ def result(scores: Sequence[EpisodeScore], action: Action = ()) -> Result:
 
 
 def measure(
-    env: EnvConfig, task: str, players: Sequence[str], episodes: int, seed: int, workers: int
+    env: EnvConfig, task: str, controllers: Sequence[str], episodes: int, seed: int, workers: int
 ) -> dict[str, Result]:
-    """Player -> figures."""
+    """Controller -> metrics."""
     scenarios = [held_out(task, seed, i) for i in range(episodes)]
     with closing(EpisodePool(EpisodeSetup(env, seed=seed), workers)) as pool:
 
@@ -86,7 +87,7 @@ def measure(
             return [list(scores) for scores in batched(_play(pool, groups), len(scenarios))]
 
         found = {}
-        for name in players:
+        for name in controllers:
             action: Action = ()
             if name == "constant":
                 action = search_constant(task, seed, hold_each).action
@@ -112,35 +113,35 @@ def released(env_config: EnvConfig, episodes: int, seed: int) -> float:
     due = env_config.wall.disturbed_time + RELEASE_S
     free = np.zeros(episodes, np.bool_)
     while not env.done.all():
-        result = env.step(oracle.act(env))
+        step = env.step(oracle.act(env))
         state = env.privileged_state()
         away = np.linalg.norm(state.hands_b - start, axis=-1).max(axis=-1)
         now = np.abs(state.since_event - due) < PLANNER_DT / 2
         free[now] = away[now] < NEUTRAL_M
-    return float(np.mean(free & ~result.terminated))
+    return float(np.mean(free & ~step.terminated))
 
 
-def way(player: str, found: dict[str, Result]) -> float | None:
-    """Share of the way from the reward of `random` (0) to that of `oracle` (1).
+def normalized_reward(controller: str, found: dict[str, Result]) -> float | None:
+    """Reward scaled so that `random` has 0 and `oracle` 1.
 
     None if one of them did not play, or if the oracle does not earn more.
     """
     if not {"random", "oracle"} <= found.keys():
         return None
     low, high = found["random"].reward, found["oracle"].reward
-    return (found[player].reward - low) / (high - low) if high > low else None
+    return (found[controller].reward - low) / (high - low) if high > low else None
 
 
 def rows(name: str, found: dict[str, Result]) -> list[str]:
-    """A line per player."""
+    """A line per controller."""
     lines = []
-    for player, r in found.items():
-        done = way(player, found)
+    for controller, r in found.items():
+        normalized = normalized_reward(controller, found)
         (low, high), (least, most) = r.success_ci95, r.reward_ci95
         line = (
-            f"{name:<14}{player:<9}{r.success:>7.1%} {f'({low:.0%}-{high:.0%})':<12}"
+            f"{name:<14}{controller:<9}{r.success:>7.1%} {f'({low:.0%}-{high:.0%})':<12}"
             f"{r.reward:>+9.4f} {f'({least:+.4f} to {most:+.4f})':<22}{r.falls:>6.0%}"
-            f"{'' if done is None else f'{done:.0%}':>7}"
+            f"{'' if normalized is None else f'{normalized:.0%}':>7}"
         )
         if r.action:
             line += "  " + " ".join(f"{value:g}" for value in r.action)
@@ -150,75 +151,75 @@ def rows(name: str, found: dict[str, Result]) -> list[str]:
 
 def figures(name: str, found: dict[str, Result]) -> dict[str, object]:
     """Flat keys."""
-    prefix, out = name.replace(" ", "_"), dict[str, object]()
-    for player, r in found.items():
-        out[f"{prefix}_{player}"] = r.success
-        out[f"{prefix}_{player}_reward"] = r.reward
-        out[f"{prefix}_{player}_falls"] = r.falls
-        done = way(player, found)
-        if done is not None:
-            out[f"{prefix}_{player}_way"] = done
+    prefix, out = name.replace(" ", "_").replace("/", "_per_"), dict[str, object]()
+    for controller, r in found.items():
+        key = f"{prefix}_{controller}"
+        out |= {key: r.success, f"{key}_reward": r.reward, f"{key}_falls": r.falls}
+        normalized = normalized_reward(controller, found)
+        if normalized is not None:
+            out[f"{key}_normalized_reward"] = normalized
         if r.action:
-            out[f"{prefix}_{player}_action"] = list(r.action)
+            out[f"{key}_action"] = list(r.action)
     return out
 
 
 def main() -> None:
     """Measure and print."""
     options = parser(__doc__, rounds=None)
-    options.add_argument("--controller", default="walk", help="walk, stance, or a file")
+    options.add_argument("--controller", default="walk", help="low-level: walk, stance, or a file")
     options.add_argument("--episodes", type=int, default=100, help="scenarios of each task")
     options.add_argument("--seed", type=int, default=0, help="seed of the scenarios")
     options.add_argument("--workers", type=int, default=0, help="processes; 0: one per core")
-    options.add_argument("--players", nargs="+", choices=PLAYERS, default=PLAYERS)
     options.add_argument(
-        "--tasks",
-        nargs="*",
-        choices=("ball", "arch", "wall"),
-        default=("ball", "arch", "wall"),
-        help="which tasks at their defaults, the arch in both bands of clearance",
+        "--controllers", nargs="+", choices=CONTROLLERS, default=CONTROLLERS, help="which play"
     )
+    options.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS, help="which to play")
     options.add_argument(
         "--pushes",
         type=float,
         nargs="*",
         default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2],
-        help="m/s, speeds at which the wall is also played",
+        help="m/s, push speeds at which the wall is also played",
     )
     args = options.parse_args()
     base = replace(evaluation_config(), controller=args.controller)
     published: dict[str, object] = {}
 
-    def measured(name: str, env: EnvConfig, task: str, players: Sequence[str]) -> dict[str, Result]:
-        found = measure(env, task, players, args.episodes, args.seed, args.workers)
+    def measured(
+        name: str, env: EnvConfig, task: str, controllers: Sequence[str] = args.controllers
+    ) -> dict[str, Result]:
+        found = measure(env, task, controllers, args.episodes, args.seed, args.workers)
         published.update(figures(name, found))
         print("\n".join(rows(name, found)), flush=True)
         return found
 
     print(f"controller {make_controller(args.controller).id}, {args.episodes} episodes each")
     print(
-        f"{'task':<14}{'player':<9}{'success':>7} {'95 %':<12}{'reward':>9} {'95 %, per step':<22}"
-        f"{'falls':>6}{'way':>7}  best constant action"
+        f"{'task':<14}{'control':<9}{'success':>7} {'95 %':<12}{'reward':>9} {'95 %, per step':<22}"
+        f"{'falls':>6}{'norm.':>7}  best constant action"
     )
     if "ball" in args.tasks:
-        measured("ball", base, "ball", args.players)
-    for band, clearance in BANDS.items() if "arch" in args.tasks else ():
-        arch = replace(base.arch, clearance_range=clearance)
-        measured(f"arch {band}", replace(base, arch=arch), "arch", args.players)
+        measured("ball", base, "ball")
+    if "arch" in args.tasks:
+        measured("arch default", base, "arch")
+        low = replace(base.arch, clearance_range=LOW_CLEARANCE)
+        measured("arch low", replace(base, arch=low), "arch")
     if "wall" in args.tasks:
-        measured("wall default", base, "wall", args.players)
+        measured("wall default", base, "wall")
         published["wall_released"] = share = released(base, args.episodes, args.seed)
         print(f"wall: oracle stands with free hands {RELEASE_S:g} s after the push: {share:.0%}")
-    fair = []
-    for speed in args.pushes:
+    speeds, suitable = args.pushes if "wall" in args.tasks else [], list[str]()
+    for speed in speeds:
         wall = replace(base.wall, push_speed_range=(speed, speed), away_probability=0.0)
-        found = measured(f"wall {speed:.2f} m/s", replace(base, wall=wall), "wall", PUSHED)
-        at_rest, oracle = (found[name].success for name in PUSHED)
-        if at_rest <= MOST_AT_REST and oracle >= LEAST_BY_ORACLE:
-            fair.append(speed)
-    if args.pushes:
-        span = f"{min(fair)} to {max(fair)} m/s" if fair else "none of these"
-        print(f"pushes that hands must and can brace: {span}")
+        env = replace(base, wall=wall)
+        found = measured(f"wall {speed:.2f} m/s", env, "wall", SWEEP_CONTROLLERS)
+        if found["hold"].success <= MAX_HOLD and found["oracle"].success >= MIN_ORACLE:
+            suitable.append(f"{speed:g}")
+    if speeds:
+        print(
+            f"push speeds where `hold` succeeds in at most {MAX_HOLD:.0%} and `oracle` in at "
+            f"least {MIN_ORACLE:.0%}: {', '.join(suitable) or 'none'} m/s"
+        )
     publish(published, args.json)
 
 

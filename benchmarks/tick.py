@@ -181,7 +181,7 @@ def _observation(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return depth, state
 
 
-#: Part of a tick -> its figures, from the number of seconds to measure each case for.
+#: Part of a tick -> its metrics, from the number of seconds to measure each case for.
 PARTS: Mapping[str, Callable[[int], dict[str, object]]] = {
     "control": control_figures,
     "filter": filter_figures,

@@ -10,7 +10,7 @@ lock, then writes a complete tick to an MCAP file and to Rerun.
     stalled_disk  the same; the process that writes the MCAP file is stopped
     dead_viewer   the same; the Rerun viewer was killed
 
-``cpu`` figures are the CPU time of the loop's thread while it writes.
+``cpu`` metrics are the CPU time of the loop's thread while it writes.
 """
 
 from __future__ import annotations

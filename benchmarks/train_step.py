@@ -209,7 +209,7 @@ def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
 def measure(
     root: Path, returns: ReturnConfig, batches: list[int], threads: list[int], rounds: int
 ) -> dict[str, object]:
-    """All figures; keys say the batch and the number of threads."""
+    """All metrics; keys say the batch and the number of threads."""
     out: dict[str, object] = {"window": LENGTH, "bf16": BF16}
     for size in batches:
         for count in threads:

@@ -45,7 +45,7 @@ def show(config: MachineInfoConfig) -> None:
 
 
 def machine_report() -> dict[str, Any]:
-    """``versions`` and ``planner_backends`` by name, and the flat figures of `hardware`."""
+    """``versions`` and ``planner_backends`` by name, and the flat metrics of `hardware`."""
     return {
         "platform": platform.platform(),
         "python": platform.python_version(),

@@ -31,9 +31,9 @@ class CollectConfig:
     all. Several are interleaved."""
     preset: str = "default"
     """Starting point of all options: default (actions change every 5 to 15 steps, short episodes),
-    or paper (actions change at every step, episodes of 6 s)."""
+    or paper (actions change at every step, with full-length episodes, as in evaluation)."""
     mix: dict[str, float] = bounded({}, least=0)
-    """Relative number of planner steps of each of several tasks, '{ball: 2}'; 1 for others."""
+    """Relative share of planner ticks per task, '{ball: 2}'; 1 for tasks not listed."""
     episodes: int = bounded(200, least=1, most=10**6)
     """Number of episodes, including those that --resume finds."""
     resume: bool = False

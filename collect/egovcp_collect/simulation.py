@@ -106,7 +106,7 @@ class EpisodeRecord:
         that time, and the result of the step."""
         columns = instance.task.reward_terms
         terms = {name: float(result.reward_terms[name][row]) for name in columns}
-        sums: dict[str, float] = {}
+        sums: dict[str, float] = {}  # not from 0.0, which would turn -0.0 into 0.0 in the digest
         for name, column in columns.items():
             sums[column] = sums[column] + terms[name] if column in sums else terms[name]
         values = {

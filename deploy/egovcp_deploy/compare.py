@@ -17,7 +17,7 @@ from egovcp_deploy.scores import EpisodeScore, aligned, eval_scores, paired
 PROG: Final = "egovcp-compare"
 _LIMIT_BYTES: Final = 256 << 20
 #: Options that do not change the results.
-_IRRELEVANT: Final = ("output_dir", "num_envs", "num_workers", "episodes", "constant.path")
+_IRRELEVANT: Final = ("output_dir", "num_envs", "num_workers", "episodes", "videos")
 _EPILOG: Final = (
     "Both runs must have the same scenarios: the same --task and --seed of egovcp-eval. "
     "Differences are RUN - OTHER. Their 95 % intervals are from a bootstrap over scenarios, each "

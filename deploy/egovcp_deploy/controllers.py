@@ -38,7 +38,7 @@ _FIRST_ROUND: Final = 6  # scenarios that every candidate plays
 def reference(name: str, action: Action = ()) -> SimPolicy:
     """``hold``, ``random``, ``oracle``, or ``constant`` with its ``action``."""
     if name == CONSTANT:
-        return Constant(action, len(action))
+        return Constant(action)
     policies: dict[str, type[SimPolicy]] = {"hold": Hold, "random": RandomWalk, "oracle": Oracle}
     return policies[name]()
 
@@ -66,7 +66,7 @@ class ReferencePolicy:
         return PolicyStep(self._policy.act(self._env))  # type: ignore[arg-type]  # float64
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
-        """Do nothing: a reference keeps no state."""
+        """Do nothing: references do not use observations."""
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Do nothing."""
@@ -98,7 +98,7 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
     left. No evaluation plays these scenarios."""
     scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
     candidates, count = list(scores), _FIRST_ROUND
-    while len(candidates) > 1:
+    while len(candidates) > 1 or not scores[candidates[0]]:
         first = len(scores[candidates[0]])
         scenarios = [Scenario(task, SEARCH + seed, first + i) for i in range(count)]
         for action, played in zip(candidates, play(candidates, scenarios), strict=True):

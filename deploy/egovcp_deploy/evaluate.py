@@ -56,7 +56,7 @@ _EPILOG: Final = (
     "set. `egovcp-task list` describes the tasks; the rates of the parts of a sequence are listed "
     "below it. 'constant' is the best fixed action of a grid, found on other scenarios. plan_ms "
     "is the time per robot when num_envs robots are planned together; --num_envs=1 "
-    "--num_workers=1 gives the latency of one. Writes eval.json (figures), eval_run.json (config "
+    "--num_workers=1 gives the latency of one. Writes eval.json (metrics), eval_run.json (config "
     "and every episode) and constant.json. Ctrl-C saves the finished episodes; the result files "
     "are marked incomplete."
 )
@@ -82,7 +82,7 @@ class PpoOptions:
 
 @dataclass(frozen=True)
 class EvalConfig:
-    """Play held-out scenarios with the planner and with references; print and save figures."""
+    """Evaluate planner and reference controllers on held-out scenarios; print and save metrics."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The policy artifact; only for the controller `planner`."""
@@ -94,10 +94,10 @@ class EvalConfig:
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Which held-out scenarios."""
+    """Seed of the held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
     """Separated by commas: planner, hold (neutral pose), constant (best fixed action), random (the
-    paper's walk), oracle (scripted, uses the simulator's state), ppo (learned without a model)."""
+    paper's walk), oracle (scripted, uses the simulator's state), ppo (model-free PPO)."""
     constant: ConstantOptions = field(default_factory=ConstantOptions)
     """The reference `constant`."""
     ppo: PpoOptions = field(default_factory=PpoOptions)
@@ -105,10 +105,10 @@ class EvalConfig:
     output_dir: str = ""
     """New folder for the results."""
     videos: int = bounded(0, least=0, most=10**6)
-    """Draw the first so many scenarios of each task, with each controller, as GIF, and as MP4 if
-    PyAV is installed (egovcp[video]): rollout-<task>-<controller>-<i>.gif; needs matplotlib."""
+    """Render the first N scenarios of each task, with each controller, as GIF, and as MP4 if PyAV
+    is installed (egovcp[video]): rollout-<task>-<controller>-<i>.gif; needs matplotlib."""
     num_envs: int = bounded(8, least=1, most=65_536)
-    """Robots that each process plays side by side."""
+    """Scenarios that each process simulates in parallel."""
     num_workers: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=evaluation_config)
@@ -218,7 +218,7 @@ def evaluate(config: EvalConfig) -> None:
                 echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
             if missing := _missing(config, scores):
                 echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
-            echo(f"figures: {folder / 'eval.json'}")
+            echo(f"metrics: {folder / 'eval.json'}")
 
 
 def _sorted_scores(scores: Scores) -> Scores:

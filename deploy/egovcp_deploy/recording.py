@@ -36,7 +36,7 @@ class LogOptions:
     rrd: bool = True
     """Write a Rerun file too; Rerun also opens the MCAP file."""
     videos: int = bounded(1, least=0, most=1_000_000)
-    """Draw the first so many rollouts as PNG and GIF, and as MP4 if PyAV is installed
+    """Render the first N rollouts as PNG and GIF, and as MP4 if PyAV is installed
     (egovcp[video]); needs matplotlib."""
 
 

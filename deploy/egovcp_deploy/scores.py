@@ -1,4 +1,4 @@
-"""Figures of evaluated episodes: rates and means with 95 % confidence intervals, and tables."""
+"""Metrics of evaluated episodes: rates and means with 95 % confidence intervals, and tables."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def eval_scores(scores: Sequence[EpisodeScore]) -> EvalScores:
 
 # --- eval.json -------------------------------------------------------------------------------
 def summarise(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
-    """Figures of one controller on one task, with the keys of ``eval.json``; for a sequence also
+    """Metrics of one controller on one task, with the keys of ``eval.json``; for a sequence also
     ``parts``: part -> ``success_rate`` and ``success_ci95``."""
     plan_ms = np.concatenate([score.plan_ms for score in scores])
     parts = {name: _successes([score.parts[name] for score in scores]) for name in scores[0].parts}
@@ -71,7 +71,7 @@ def _successes(successes: Sequence[bool]) -> dict[str, Any]:
 
 
 def summary(scores: ScoreTable, requested: int) -> dict[str, dict[str, dict[str, Any]]]:
-    """``{task: {controller: figures}}``, the content of ``eval.json``. Figures of fewer than
+    """``{task: {controller: metrics}}``, the content of ``eval.json``. Metrics of fewer than
     ``requested`` episodes also hold ``incomplete`` (true) and ``episodes_requested``."""
     missing = {"incomplete": True, "episodes_requested": requested}
     return {

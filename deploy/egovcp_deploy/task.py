@@ -74,7 +74,7 @@ class CheckTaskConfig:
     seed: int = bounded(0, least=0, most=10**9)
     """Which scenarios."""
     json: str = output_file()
-    """File for the figures; empty: none."""
+    """File for the metrics; empty: none."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation."""
 

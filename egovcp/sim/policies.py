@@ -43,12 +43,8 @@ class EnvPolicy(ABC):
 class Constant(EnvPolicy):
     """The same action always."""
 
-    def __init__(
-        self, action: Sequence[float] | NDArray[np.floating], size: int = ACTION_DIM
-    ) -> None:
+    def __init__(self, action: Sequence[float] | NDArray[np.floating]) -> None:
         self._action = np.asarray(action, dtype=np.float64)
-        if self._action.shape != (size,):
-            raise UsageError(f"expected {size} numbers, found shape {self._action.shape}")
 
     def act(self, env: BaseVectorEnv) -> Array:
         return np.tile(self._action, (env.num_envs, 1))

@@ -45,12 +45,12 @@ class CellOutput:
 
 @dataclass(frozen=True)
 class CellFigure:
-    """Reference to a value in another cell's figures."""
+    """Reference to a value in another cell's metrics."""
 
     cell: str
     """Name of that cell."""
     keys: tuple[str, ...]
-    """Path in the nested figures."""
+    """Path in the nested metrics."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class CellCommand:
     output: str
     """Flag for the output folder."""
     figures: Callable[[Path], dict[str, Any]]
-    """Reads the figures to store from the output folder."""
+    """Reads the metrics to store from the output folder."""
     digest: Callable[[Path], str]
     """SHA-256 of the outputs that other cells read."""
     resume_flags: Callable[[Path], Flags | None] = lambda folder: None
@@ -186,7 +186,7 @@ def _ppo_digest(folder: Path) -> str:
 
 
 def _eval_figures(folder: Path) -> dict[str, Any]:
-    """Task -> controller -> figures; ``played`` has a column per episode quantity."""
+    """Task -> controller -> metrics; ``played`` has a column per episode quantity."""
     run = read_json(folder / "eval_run.json")["episodes"]
     return {
         task: {name: {**row, "played": _columns(run[task][name])} for name, row in rows.items()}

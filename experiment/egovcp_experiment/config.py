@@ -17,10 +17,10 @@ TASKS: Final = ("ball", "wall", "arch")
 class EpisodesConfig:
     """Number of episodes per task."""
 
-    ball: int = bounded(1334, least=1, most=1_000_000)
-    """Episodes of the ball task, by default of 150 ticks each."""
-    wall: int = bounded(1334, least=1, most=1_000_000)
-    """Episodes of the wall task, by default of 150 ticks each."""
+    ball: int = bounded(5400, least=1, most=1_000_000)
+    """Episodes of the ball task, by default of 60 ticks each."""
+    wall: int = bounded(4000, least=1, most=1_000_000)
+    """Episodes of the wall task, by default of 100 ticks each."""
     arch: int = bounded(870, least=1, most=1_000_000)
     """Episodes of the arch task, by default of 230 ticks each."""
 
@@ -34,8 +34,8 @@ class DataConfig:
     seed: int = bounded(0, least=0)
     """Seed of the collection."""
     parts: tuple[float, ...] = bounded((0.125, 0.25, 0.5, 1.0), above=0)
-    """Shares of the episodes that sample-efficiency trains on, ascending; above 1, more episodes
-    are collected for it."""
+    """Shares of the episodes that sample-efficiency trains on; above 1, more episodes are collected
+    for it."""
     roots: dict[str, str] = field(default_factory=dict)
     """Existing datasets per task, '{ball: data/ball}', instead of collecting."""
     flags: tuple[str, ...] = ()
@@ -79,9 +79,10 @@ class PlayConfig:
     seed: int = bounded(0, least=0)
     """Seed of the held-out scenarios."""
     branches: int = bounded(12, least=2, most=10_000)
-    """Random walks from each step of a plan, whose mean return is the target of Q in variance."""
+    """Random-walk rollouts from each plan step; their mean return is what Q is compared with
+    (experiment `variance`)."""
     budget_ms: float = bounded(40.0, above=0)
-    """Time per plan for the searches that planners compares, ms."""
+    """Time budget per plan in the experiment `planners`, ms."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-eval; studies in simulation use those of the planner."""
 
@@ -116,13 +117,13 @@ class PpoBaselineConfig:
         return tuple(each * (k + 1) for k in range(self.policies))
 
     def check(self) -> None:
-        """Raise `UsageError` for flags that would change which policies are saved."""
+        """Raise `UsageError` for flags that would change when policies are saved."""
         own = ("steps", "robots", "ppo.num_steps_per_env", "save_freq", "max_minutes")
         for flag in self.flags:
             if flag.removeprefix("--").split("=", 1)[0] in own:
                 raise UsageError(
-                    f"--ppo.flags holds {flag}, which decides what policies there are; say it with "
-                    "--ppo.steps, --ppo.policies, --ppo.robots and --ppo.ticks"
+                    f"--ppo.flags holds {flag}, which changes when policies are saved; set "
+                    "--ppo.steps, --ppo.policies, --ppo.robots and --ppo.ticks instead"
                 )
 
 
@@ -138,7 +139,7 @@ class ExperimentConfig:
     output_dir: str = ""
     """Folder of cells and reports; experiments with the same options can share it."""
     scale: Literal["smoke", "small", "paper"] = "small"
-    """smoke: minutes, figures without meaning; small: hours on two cores; paper: the paper's."""
+    """smoke: minutes, metrics without meaning; small: hours on two cores; paper: the paper's."""
     jobs: int = bounded(1, least=1, most=1024)
     """Cells that run at the same time, each on its share of the CPU cores."""
     tasks: tuple[str, ...] = TASKS
@@ -201,7 +202,7 @@ class ExperimentConfig:
 
 
 def smoke() -> ExperimentConfig:
-    """Every command of an experiment once, in minutes; the figures mean nothing."""
+    """Every command of an experiment once, in minutes; the metrics mean nothing."""
     return ExperimentConfig(
         scale="smoke",
         most=3,
@@ -247,7 +248,6 @@ def small() -> ExperimentConfig:
     100 paired episodes."""
     return ExperimentConfig(
         scale="small",
-        data=DataConfig(EpisodesConfig(ball=5400, wall=4000, arch=870)),
         train=TrainingConfig(
             max_minutes=10.0,
             compared_steps=1000,

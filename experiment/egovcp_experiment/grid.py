@@ -104,7 +104,7 @@ class Grid:
         return CellOutput(self.train(task, seed, model).name, ARTIFACT)
 
     def train(self, task: str, seed: int, model: Model, name: str = "") -> Cell:
-        """A training, whose figures are those on held-out episodes."""
+        """A training, whose metrics are those on held-out episodes."""
         config = self.config.train
         tasks = self.config.tasks if task == ALL else (task,)
         data: dict[str, Any] = {"dataset.root": self.data(tasks[0])}
@@ -113,7 +113,7 @@ class Grid:
         flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
         if config.max_minutes:
             flags["max_minutes"] = config.max_minutes
-        flags = {**flags, **_parsed(config.flags), **model.flags}
+        flags = {**flags, **parse_flags(config.flags), **model.flags}
         return self.add(Cell(name or f"train-{task}-{model.name}-s{seed}", TRAIN, flags))
 
     def plays(
@@ -162,25 +162,25 @@ class Grid:
     ) -> str:
         """Name of the cell STUDY-TASK: a study of the task's first default model, with the planner
         flags of egovcp-eval."""
-        play = _parsed(self.config.play.flags)
+        play = parse_flags(self.config.play.flags)
         planner = {flag: value for flag, value in play.items() if flag.startswith("planner.")}
         policy = self.model(task, self.config.train.seeds[0])
         cell = name if task == ALL else f"{name}-{task}"
         flags = {**planner, "policy.path": policy, **flags}
         return self.add(Cell(cell, study(name, exclusive), flags, tuple(extra))).name
 
-    def sim_study(self, name: str, task: str, flags: Flags, extra: Sequence[str] = ()) -> str:
+    def sim_study(self, name: str, task: str, flags: Flags) -> str:
         """Name of the cell of a study in simulation, in the configured scenes."""
         seed = {"seed": self.config.play.seed}
-        return self.study(name, task, {**flags, **seed}, (*self.config.scenes, *extra))
+        return self.study(name, task, {**flags, **seed}, self.config.scenes)
 
     def scenarios(self, task: str) -> Flags:
         """Flags of egovcp-eval for the scenarios of a task."""
         config = self.config.play
-        given = _parsed((*self.config.scenes, *config.flags))
+        given = parse_flags((*self.config.scenes, *config.flags))
         return {"task": task, "episodes": config.episodes, "seed": config.seed, **given}
 
 
-def _parsed(flags: Sequence[str]) -> dict[str, str]:
+def parse_flags(flags: Sequence[str]) -> dict[str, str]:
     """Name -> value of ``--name=value``; the last one counts."""
     return dict(flag.removeprefix("--").split("=", 1) for flag in flags)

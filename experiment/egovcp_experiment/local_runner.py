@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # not imported in the processes of cells
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that figures depend on."""
+    """Versions of the packages that metrics depend on."""
     return {name: version(name) for name in ("egovcp", "torch", "numpy", "mujoco")}
 
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 from egovcp.files import write_json, write_text
 from egovcp_experiment.cell import Record
 
-_SMOKE: Final = "Scale `smoke`: every command ran once. **The figures mean nothing.**"
+_SMOKE: Final = "Scale `smoke`: every command ran once. **The metrics mean nothing.**"
 _DIGITS: Final = 12  # of a shortened hash
 _STYLE: Final = """
 body { font: 15px/1.45 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -24,7 +24,7 @@ td { font-variant-numeric: tabular-nums; }
 code { font-size: 12px; overflow-wrap: anywhere; }
 figure { margin: 1em 0; } figcaption { color: #555; font-size: 13px; }
 svg { max-width: 100%; height: auto; }
-.shows { background: #f4f4ee; padding: 0.5em 1.5em; }
+.findings { background: #f4f4ee; padding: 0.5em 1.5em; }
 """
 
 
@@ -57,9 +57,9 @@ class ExperimentReport:
 
     title: str
     """One line."""
-    shows: list[str] = field(default_factory=list)
-    """Conclusions that are derived from the figures."""
-    parts: list[Part] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+    """Conclusions that are derived from the metrics."""
+    sections: list[Part] = field(default_factory=list)
     """Paragraphs, tables and drawings."""
     figures: dict[str, Any] = field(default_factory=dict)
     """The same for programs."""
@@ -124,12 +124,12 @@ def publish(
     if missing:
         total = len(records) + len(missing)
         notes.append(f"**Incomplete**: {len(records)} of {total} cells so far.")
-    report = replace(report, shows=[*notes, *report.shows])
+    report = replace(report, findings=[*notes, *report.findings])
     origin = _origin(records, command)
     content = {
         "experiment": name,
         "title": report.title,
-        "shows": report.shows,
+        "shows": report.findings,
         "figures": report.figures,
         "cells": dict(records),
         "missing": list(missing),
@@ -138,7 +138,7 @@ def publish(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / f"{name}.json", content)
-    for part in report.parts:
+    for part in report.sections:
         if isinstance(part, Plot):
             head = '<?xml version="1.0" encoding="utf-8"?>\n'
             write_text(folder / f"{name}-{part.name}.svg", f"{head}{part.svg}\n")
@@ -185,9 +185,9 @@ def _markdown(report: ExperimentReport, origin: Sequence[Part], stem: str) -> st
         rows = "\n".join(f"| {' | '.join(line)} |" for line in cells)
         return f"**{part.title}**\n\n{rows}" if part.title else rows
 
-    shows = "\n".join(f"- {line}" for line in report.shows)
-    parts = [convert(part) for part in (*report.parts, *origin)]
-    return "\n\n".join([f"# {report.title}", "**What it shows**", shows, *parts]) + "\n"
+    findings = "\n".join(f"- {line}" for line in report.findings)
+    sections = [convert(part) for part in (*report.sections, *origin)]
+    return "\n\n".join([f"# {report.title}", "**What it shows**", findings, *sections]) + "\n"
 
 
 def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
@@ -205,12 +205,12 @@ def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
         return f"{title}<table><tr>{head}</tr>\n{rows}</table>"
 
     title = escape(report.title)
-    shows = "".join(f"<li>{_inline(line)}</li>" for line in report.shows)
+    findings = "".join(f"<li>{_inline(line)}</li>" for line in report.findings)
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{title}</title><style>{_STYLE}</style></head><body>\n<h1>{title}</h1>\n"
-        f'<div class="shows"><b>What it shows</b><ul>{shows}</ul></div>\n'
-        + "\n".join(map(convert, report.parts))
+        f'<div class="findings"><b>What it shows</b><ul>{findings}</ul></div>\n'
+        + "\n".join(map(convert, report.sections))
         + "\n<details><summary>How each number was made</summary>\n"
         + "\n".join(map(convert, origin))
         + "\n</details>\n</body></html>\n"

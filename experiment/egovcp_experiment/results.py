@@ -51,7 +51,7 @@ def controller_scores(
 
 
 def figures_of(scores: Mapping[Any, EvalScores]) -> dict[str, Any]:
-    """Name -> figures."""
+    """Name -> metrics."""
     return {str(name): each.figures() for name, each in scores.items()}
 
 

@@ -96,7 +96,7 @@ class CellStore:
         return True
 
     def settings(self, cell: Cell) -> dict[str, Any]:
-        """All that the figures of a cell depend on; folders are identified by their hashes."""
+        """All that the metrics of a cell depend on; folders are identified by their hashes."""
 
         def identity(reference: Reference) -> Any:
             match reference:

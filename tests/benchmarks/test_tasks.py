@@ -25,16 +25,16 @@ def test_a_result_counts_successes_falls_and_reward_per_step():
     assert found.reward_ci95 == pytest.approx((0.1, 0.3))
 
 
-def test_the_way_leads_from_random_to_the_oracle():
+def test_normalized_reward_is_0_for_random_and_1_for_the_oracle():
     found = _found(hold=0.02, random=-0.01, oracle=0.05)
-    assert tasks.way("hold", found) == pytest.approx(0.5)
-    assert tasks.way("random", found) == 0.0
-    assert tasks.way("oracle", found) == 1.0
+    assert tasks.normalized_reward("hold", found) == pytest.approx(0.5)
+    assert tasks.normalized_reward("random", found) == 0.0
+    assert tasks.normalized_reward("oracle", found) == 1.0
 
 
-def test_there_is_no_way_without_an_oracle_that_earns_more():
-    assert tasks.way("hold", _found(hold=0.02, oracle=0.05)) is None
-    assert tasks.way("hold", _found(hold=0.02, random=0.05, oracle=0.05)) is None
+def test_no_normalized_reward_without_an_oracle_that_earns_more():
+    assert tasks.normalized_reward("hold", _found(hold=0.02, oracle=0.05)) is None
+    assert tasks.normalized_reward("hold", _found(hold=0.02, random=0.05, oracle=0.05)) is None
 
 
 def test_rows_are_narrow_and_name_the_best_constant_action():
@@ -45,10 +45,11 @@ def test_rows_are_narrow_and_name_the_best_constant_action():
     assert len(lines) == 4
     assert max(map(len, lines)) <= 120
     assert lines[-1].endswith("50%  0.45 -0.3 0.85 0.45 0.3 0.85 0")
-    assert tasks.figures("wall 0.85 m/s", found)["wall_0.85_m/s_constant_way"] == pytest.approx(0.5)
+    figures = tasks.figures("wall 0.85 m/s", found)
+    assert figures["wall_0.85_m_per_s_constant_normalized_reward"] == pytest.approx(0.5)
 
 
-def test_all_players_play_a_task(monkeypatch: pytest.MonkeyPatch):
+def test_all_controllers_play_a_task(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tasks, "search_constant", lambda t, s, play: _Best(play))
     env = replace(evaluation_config(), controller="stance")
     found = tasks.measure(env, "ball", ("hold", "constant"), 1, 0, 1)

@@ -48,6 +48,13 @@ def test_the_best_action_wins_under_noise_shared_by_all(task: str, which: int) -
     assert found.episodes == sum(action == best for action, _ in land.played)
 
 
+def test_a_grid_of_the_neutral_pose_alone_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
+    neutral = (0.0,) * ACTION_DIM
+    monkeypatch.setattr("egovcp_deploy.controllers.grid", lambda task: [neutral])
+    found = search_constant("ball", 0, Landscape(neutral, noise=0.0))
+    assert (found.action, found.episodes) == (neutral, 6)
+
+
 def test_candidates_play_the_same_scenarios_and_none_of_the_evaluation() -> None:
     land = Landscape(grid("ball")[3], noise=1.0)
     search_constant("ball", 4, land)

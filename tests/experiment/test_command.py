@@ -39,6 +39,7 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
         (["table1", "--output_dir=x", "--data.roots={bal: y}"], "did you mean 'ball'"),
         (["table1", "--output_dir=x", "--train.policies={wal: y}"], "did you mean 'wall'"),
         (["table1", "--output_dir=x", "--train.compared_steps=0"], "expected at least 1"),
+        (["ablations", "--output_dir=x", "--train.preset=paper"], "--train.preset=paper"),
     ],
 )
 def test_misuse_ends_with_2_before_anything_is_written(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, get_type_hints
 
 import pytest
 
-from egovcp.cli import parse_config
+from egovcp.cli import parse_config, preset_defaults
+from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_experiment.cell import (
     ARTIFACT,
     COLLECT,
@@ -33,6 +35,7 @@ from egovcp_experiment.config import (
 )
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.grid import ALL, Grid, Model
+from egovcp_experiment.studies.residuals import ResidualsConfig
 
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
@@ -86,7 +89,7 @@ def test_the_multitask_model_reads_the_data_of_all_tasks() -> None:
     grid = Grid(ExperimentConfig())
     grid.plays("ball", "mixed", trained_on=ALL)
     train = next(cell for cell in grid.cells if cell.command is TRAIN)
-    names = ("collect-ball-1334", "collect-wall-1334", "collect-arch-870")
+    names = ("collect-ball-5400", "collect-wall-4000", "collect-arch-870")
     assert train.flags["datasets"] == [{"root": CellOutput(name)} for name in names]
 
 
@@ -102,6 +105,17 @@ def test_studies_use_the_planner_flags_of_egovcp_eval(name: str) -> None:
     for cell in studies:
         assert cell.flags["planner.samples"] == "256"
         assert "num_workers" not in cell.flags
+
+
+@pytest.mark.parametrize("flags", [(), ("--eta=0.5",), ("--preset=paper",)])
+def test_branches_of_variance_walk_as_the_data(flags: tuple[str, ...]) -> None:
+    data = parse_config(CollectConfig, flags, "collect", "", partial(preset_defaults, PRESETS))
+    cells = EXPERIMENTS["variance"].cells(ExperimentConfig(data=DataConfig(flags=flags)))
+    study = next(cell for cell in cells if cell.name.startswith("residuals"))
+    walk = {k: v for k, v in study.flags.items() if k in ("eta", "step_ticks", "boundary")}
+    found = parse_config(ResidualsConfig, to_argv(walk), "residuals")
+    assert (found.eta, found.step_ticks) == (data.eta, data.step_ticks)
+    assert found.boundary == data.boundary
 
 
 def test_timing_cells_are_exclusive() -> None:

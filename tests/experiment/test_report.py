@@ -60,7 +60,7 @@ def test_the_page_refers_to_nothing_outside(tmp_path: Path) -> None:
 
 
 def test_drawings_are_reproducible() -> None:
-    assert _report().parts[2] == _report().parts[2]
+    assert _report().sections[2] == _report().sections[2]
 
 
 def test_smoke_and_missing_cells_come_first(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_compatible
 from egovcp.plan.config import PAPER_PLANNER, require_affordable
 from egovcp.robot_spec import G1, RobotSpec
-from egovcp_train.records import WandbConfig
+from egovcp_train.loggers import WandbConfig
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class TrainConfig:
     wandb: WandbConfig = field(default_factory=WandbConfig)
     """Weights & Biases."""
     trackio: str = ""
-    """Also record to this project of Trackio, on this machine (`trackio show`); empty: do not."""
+    """Also log to this project of Trackio, on this machine (`trackio show`); empty: do not."""
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:

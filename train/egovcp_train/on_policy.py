@@ -20,8 +20,8 @@ from egovcp.cli import save_config
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import CONFIG_FILE, checkpoint_dir, new_checkpoint, restoring
+from egovcp_train.loggers import Loggers, TensorBoardLogger
 from egovcp_train.loop import Budget
-from egovcp_train.records import Records, TensorBoardRecorder
 
 type Log = dict[str, list[float]]
 
@@ -187,7 +187,7 @@ def run_iterations(
     output.mkdir(parents=True, exist_ok=True)
     save_config(replace(config, resume=False), str(output / CONFIG_FILE))
     budget = Budget(config.steps, config.max_minutes, spent=float(state.get("seconds", 0.0)))
-    recorder = Records([TensorBoardRecorder(output)] if config.tensorboard else [])
+    loggers = Loggers([TensorBoardLogger(output)] if config.tensorboard else [])
 
     def save() -> None:
         state = learner.state_dict() | {"seconds": budget.spent}
@@ -208,14 +208,14 @@ def run_iterations(
     ):
         while budget.progress(learner.steps) < 1.0 and not stopped:
             scalars = learner.iterate()
-            recorder.scalars(learner.steps, scalars)
+            loggers.log_scalars(learner.steps, scalars)
             bar.set_postfix(summary(scalars), refresh=False)
             bar.update(learner.steps - bar.n)
             if learner.iteration % config.save_freq == 0:
                 save()
     if learner.iteration > start and learner.iteration % config.save_freq:
         save()
-    recorder.close()
+    loggers.close()
     finished = budget.progress(learner.steps) >= 1.0
     folder = checkpoint_dir(output, learner.iteration) / "pretrained_model"
     echo(final_message(folder, "done" if finished else "stopped early"))

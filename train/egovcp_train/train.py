@@ -53,9 +53,9 @@ from egovcp_train.datasets import (
 from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
 from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
+from egovcp_train.loggers import Logger, Loggers, TensorBoardLogger, TrackioLogger, WandbLogger
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.publish import publish_trained, reserve_policy, versions, write_card
-from egovcp_train.records import Records, TensorBoardRecorder, TrackioRecorder, WandbRecorder
 
 PROG = "egovcp-train"
 EPILOG = (
@@ -172,7 +172,7 @@ class TrainingRun:
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
         self.played: dict[str, float] = {}
-        self.recorder = _records(config, output)
+        self.loggers = _loggers(config, output)
 
     def execute(self) -> None:
         """Train until the budget or a signal ends it; the last state is always saved.
@@ -197,8 +197,8 @@ class TrainingRun:
         echo(self._final_message(artifact, stopped=not finished))
         write_card(artifact, self.output, self.config.policy.repo_id)
         if finished:
-            self.recorder.policy(self.learner.step, artifact)
-        self.recorder.close()
+            self.loggers.log_policy(self.learner.step, artifact)
+        self.loggers.close()
         if finished and self.config.policy.push_to_hub:
             publish_trained(artifact, self.config.policy)
 
@@ -221,7 +221,7 @@ class TrainingRun:
                 terms = learner.update(batch, progress)
                 bar.update()
                 if learner.step % config.log_freq == 0:
-                    self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
+                    self.loggers.log_scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
                     if learner.unrecorded and not warned:
                         warned = True
@@ -258,10 +258,12 @@ class TrainingRun:
         """Record the last measurements and their pictures."""
         step, heldout = self.learner.step, self.metrics | scalars(self.tasks)
         found = {f"heldout/{k}": v for k, v in heldout.items()}
-        self.recorder.scalars(step, found | {f"closed_loop/{k}": v for k, v in self.played.items()})
-        if self.recorder:
+        self.loggers.log_scalars(
+            step, found | {f"closed_loop/{k}": v for k, v in self.played.items()}
+        )
+        if self.loggers:
             for name, picture in draw(report).items():
-                self.recorder.image(step, f"heldout/{name}", picture)
+                self.loggers.log_image(step, f"heldout/{name}", picture)
 
     def save(self) -> None:
         """Write a checkpoint: the averaged model as artifact, and the training state.
@@ -324,15 +326,15 @@ def _prepare_output(config: TrainConfig) -> Path:
     return output
 
 
-def _records(config: TrainConfig, output: Path) -> Records:
-    found: list[TensorBoardRecorder | TrackioRecorder] = []
+def _loggers(config: TrainConfig, output: Path) -> Loggers:
+    found: list[Logger] = []
     if config.tensorboard:
-        found.append(TensorBoardRecorder(output))
+        found.append(TensorBoardLogger(output))
     if config.wandb.enable:
-        found.append(WandbRecorder(output, config.wandb, draccus.encode(config)))
+        found.append(WandbLogger(output, config.wandb, draccus.encode(config)))
     if config.trackio:
-        found.append(TrackioRecorder(output, config.trackio, draccus.encode(config)))
-    return Records(found)
+        found.append(TrackioLogger(output, config.trackio, draccus.encode(config)))
+    return Loggers(found)
 
 
 def _restore(output: Path, learner: Learner, data: TrainingData) -> float:

@@ -16,6 +16,7 @@ from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
 from egovcp.files import write_text
 from egovcp.help_text import field_docs
+from egovcp.hub import is_repo_id
 from egovcp.outputs import output_file
 from egovcp.sim.config import BaseEnvConfig, EnvConfig
 from egovcp.sim.tasks.registry import describe_task
@@ -47,6 +48,8 @@ class CardConfig:
 def run_card(config: CardConfig) -> None:
     """Write card and plots."""
     require_matplotlib()
+    if config.repo_id and not is_repo_id(config.repo_id):
+        raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name")
     reader = DatasetReader.open(config.dataset)
     if reader.source.commit and not config.output:
         raise UsageError(
@@ -118,8 +121,9 @@ def _render(
 
 def _size_category(rows: int) -> str:
     """The Hub's name for a number of rows."""
-    bounds = {1_000: "n<1K", 10_000: "1K<n<10K", 100_000: "10K<n<100K", 1_000_000: "100K<n<1M"}
-    return next((name for bound, name in bounds.items() if rows < bound), "1M<n<10M")
+    bounds = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B")
+    place = max(0, len(str(rows)) - 3)
+    return f"{bounds[place - 1]}<n<{bounds[place]}" if place else "n<1K"
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -181,8 +185,8 @@ def coverage_table(tasks: Sequence[TaskStatistics]) -> str:
 def event_table(tasks: Sequence[TaskStatistics]) -> str:
     """Rate of each reward term."""
     rows = [
-        (task.task, f"`{name}`", f"{rate.per_1000_steps:.2f}", f"{rate.episode_share:.1%}")
+        (task.task, f"`{name}`", f"{rate.per_1000_ticks:.2f}", f"{rate.episode_share:.1%}")
         for task in tasks
         for name, rate in task.events.items()
     ]
-    return markdown_table(("task", "term", "ticks per 1000 steps", "episodes"), rows)
+    return markdown_table(("task", "term", "per 1000 ticks", "episodes"), rows)

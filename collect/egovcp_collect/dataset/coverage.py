@@ -123,9 +123,9 @@ def _describe(task: TaskStatistics) -> Iterator[str]:
     yield f"{task.task}:"
     for name, text in coverage_column(task).items():
         yield f"  {name:54}{text}"
-    yield "  events                    ticks per 1000 steps, share of episodes"
+    yield "  events                    per 1000 ticks, share of episodes"
     for name, rate in task.events.items():
-        yield f"    {name:24}{rate.per_1000_steps:8.2f}   {rate.episode_share:8.1%}"
+        yield f"    {name:24}{rate.per_1000_ticks:8.2f}   {rate.episode_share:8.1%}"
     yield "  actions                   uniformity (0 to 1), range of targets in m"
     for name, (low, high) in task.action.workspace_m.items():
         yield f"    {name:24}{task.action.uniformity[name]:8.2f}     {low:6.2f} to {high:5.2f}"

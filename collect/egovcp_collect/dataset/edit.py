@@ -62,7 +62,7 @@ def run_delete(config: DeleteConfig) -> None:
     """Write the new dataset."""
     reader, count = _open(config.dataset)
     if not config.episodes:
-        raise UsageError("which episodes shall be left out? give --episodes='[3, 7]'")
+        raise UsageError("--episodes is missing; name the episodes to leave out, '[3, 7]'")
     left_out = select_episodes(config.episodes, count, "--episodes").tolist()
     kept = sorted(set(range(count)) - set(left_out))
     if not kept:

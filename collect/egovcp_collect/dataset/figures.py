@@ -71,13 +71,13 @@ def _label(axes: Any, x: str = "", y: str = "", title: str = "", legend: bool = 
 
 
 def _events(tasks: Sequence[TaskStatistics]) -> Any:
-    """Bars of ticks per 1000 steps, one panel per task."""
+    """Bars of event ticks per 1000 ticks, one panel per task."""
     bars = max(len(task.events) for task in tasks)
     figure = _figure(4.2 * max(len(tasks), 2), 0.9 + 0.32 * bars)
     for axes, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
         good, bad = GOOD_TERMS, (*BAD_TERMS, "touch.other")
         names = list(task.events)
-        rates = [task.events[name].per_1000_steps for name in names]
+        rates = [task.events[name].per_1000_ticks for name in names]
         colours = [_GOOD if n in good else _BAD if n in bad else _NEUTRAL for n in names]
         axes.barh(range(len(names)), rates, color=colours, height=0.7)
         axes.set_yticks(range(len(names)), names)
@@ -92,7 +92,7 @@ def _events(tasks: Sequence[TaskStatistics]) -> Any:
             text = f" {number}, in {event.episode_share:.0%} of episodes"
             axes.text(rate, i, text if event.ticks else " never", va="center", fontsize=8)
         title = f"{task.task}: {task.episodes} episodes, {task.steps} steps"
-        _label(axes, "ticks per 1000 steps", title=title)
+        _label(axes, "per 1000 ticks", title=title)
     return figure
 
 
@@ -102,14 +102,14 @@ def _returns(tasks: Sequence[TaskRows], config: ReturnConfig) -> Any:
     columns = figure.subplots(2, len(tasks), squeeze=False).T
     for (above, below), rows, colour in zip(columns, tasks, cycle(_COLOURS)):
         title = f"{rows.task}: return over {config.steps} ticks"
-        above.set_title(title, fontsize=10)
         if rows.mc_valid.any():
-            _return_histogram(above, rows, config, title)
+            _return_histogram(above, rows, config)
             _return_around_event(below, rows, colour)
+        above.set_title(title, fontsize=10)
     return figure
 
 
-def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig, title: str) -> None:
+def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig) -> None:
     good, bad = events_ahead(rows, config.steps)
     kinds = {"a cost ahead": bad, "a reward, no cost ahead": good & ~bad, "neither": ~good & ~bad}
     valid = rows.mc_valid
@@ -120,14 +120,13 @@ def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig, title: st
         axes.stairs(counts, edges, fill=True, alpha=0.55, color=colour, label=label)
     axes.set_yscale("symlog", linthresh=10)  # shows 0, too
     axes.set_ylim(0, None)
-    _label(axes, "Monte Carlo return", "rows", title, legend=True)
+    _label(axes, "Monte Carlo return", "rows", legend=True)
 
 
 def _return_around_event(axes: Any, rows: TaskRows, colour: str) -> None:
     """Mean, median and 5 to 95 % of the return over the time since the event."""
-    events = [metadata.get("event_tick") for metadata in rows.metadata]
-    starts = rows.start + [10**9 if tick is None else tick for tick in events]
-    since = np.arange(len(rows.reward)) - np.repeat(starts, rows.length)
+    events = np.array([metadata.get("event_tick") for metadata in rows.metadata], np.float64)
+    since = np.arange(len(rows.reward)) - np.repeat(rows.start + events, rows.length)  # NaN: none
     values = {t: rows.mc_return[(since == t) & rows.mc_valid] for t in range(*_AROUND_EVENT)}
     values = {t: returns for t, returns in values.items() if len(returns) >= 5}
     if values:
@@ -156,7 +155,7 @@ def _actions(statistics: DatasetStatistics) -> Any:
         axes.set(xlim=(-1, 1), xticks=[-1, 0, 1])
         _label(axes, title=name.replace("_", " "))
     panels[0].set_ylim(0, None)  # shared by all panels
-    panels[0].set_ylabel("density (even: 1)", fontsize=9)
+    panels[0].set_ylabel("density (uniform: 1)", fontsize=9)
     if len(statistics.tasks) > 1:
         panels[-1].legend(fontsize=7, frameon=False, loc="lower center")
     _hand_densities(bottom, statistics)

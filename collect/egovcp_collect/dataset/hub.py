@@ -127,7 +127,7 @@ def run_pull(config: PullConfig) -> None:
     if config.dataset.root or not is_repo_id(repo_id):
         raise UsageError("pull takes the id of a dataset on the Hub, user/name")
     if not config.output_dir:
-        raise UsageError("--output_dir is missing: the new folder for the dataset")
+        raise UsageError("--output_dir is missing; name the folder of the new dataset")
     root = resolve_root(config.output_dir)
     is_download = (root / schema.SOURCE_PATH).is_file()
     if not is_download:

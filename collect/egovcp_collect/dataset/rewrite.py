@@ -38,8 +38,8 @@ from egovcp_collect.dataset.subset import SubsetWriter, scan_episodes
 class MergeConfig:
     """Write the episodes of several datasets to one new dataset; the others are not changed.
 
-    They must have been collected with the same low-level controller. Each episode is compared with
-    the SHA-256 recorded at its collection, and keeps its metadata."""
+    They must have been collected with the same low-level controller. Each episode is verified
+    against its recorded SHA-256, and keeps its metadata."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The first dataset."""
@@ -106,7 +106,7 @@ def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
         EnvironmentFailure: it is a mount point.
     """
     if not output_dir:
-        raise UsageError("where does the new dataset go? give --output_dir=FOLDER")
+        raise UsageError("--output_dir is missing; name the folder of the new dataset")
     folder = resolve_root(output_dir)
     for source in sources:
         if folder.is_relative_to(source.resolve()):
@@ -166,9 +166,8 @@ def run_repair(config: RepairConfig) -> None:
     with DatasetWriter(output, index.provenance) as writer:
         for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
             writer.add(episode)
-        if not writer.num_episodes:
-            _report(config, root, output, writer, dropped)  # raises: nothing is written
-    _report(config, root, output, writer, dropped)
+        result = _report(config, root, writer, dropped)
+    echo(f"{output}: {result}")
 
 
 def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
@@ -182,20 +181,19 @@ def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
             else:
                 writer.add(found)
         echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
-        if not writer.num_episodes:
-            _report(config, root, output, writer, dropped)  # raises: nothing is written
+        result = _report(config, root, writer, dropped)
         writer.finish()
-    _report(config, root, output, writer, dropped)
+    echo(f"{output}: {result}")
 
 
 def _report(
     config: RepairConfig,
     root: Path,
-    output: Path,
     writer: DatasetWriter | SubsetWriter,
     dropped: list[DataError],
-) -> None:
-    """Print and write the result; raises `DataError` if no episode is kept."""
+) -> str:
+    """Print the problems, write the report and return a summary; raises `DataError` if no episode
+    is kept, so that the unfinished dataset is removed."""
     kept, frames = writer.num_episodes, writer.num_frames
     for error in dropped:
         echo(one_line(f"dropped: {error}"))
@@ -203,7 +201,8 @@ def _report(
     write_report(config.json, {"episodes": kept, "frames": frames, "dropped": problems})
     if not kept:
         raise DataError(f"no episode of {root} can be kept; {len(dropped)} problem(s), see above")
-    echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
+    lost = len({error.episode for error in dropped} - {None})
+    return f"{kept} episodes, {frames} frames; dropped {lost} episodes ({len(dropped)} problems)"
 
 
 def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) -> Iterator[Episode]:
@@ -246,8 +245,9 @@ def _validate(
         time_limit=record["time_limit"],
         metadata=record.get("metadata", {}),
     )
-    for frame, problem in itertools.chain(episode.problems(), command_problems(episode)):
-        return DataError.at(found.file, problem, found.number, frame)
+    first = next(itertools.chain(episode.problems(), command_problems(episode)), None)
+    if first is not None:
+        return DataError.at(found.file, first[1], found.number, first[0])
     try:
         scenario = scenarios.key(episode.task, episode.metadata)
     except DataError as error:

@@ -1,7 +1,8 @@
 """Statistics of a dataset per task: events, returns, actions, drawn parameters, depth.
 
-An *event row* is one whose reward differs from the task's median reward by more than
-`EVENT_REWARD`. Rewards are stored per row, their terms as sums per episode only.
+An *event row* is one with a nonzero term of `GOOD_TERMS` or `BAD_TERMS`. In datasets of earlier
+versions, which lack the terms of each row, it is one whose reward differs from the task's median
+reward by more than `EVENT_REWARD`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp.data import DatasetReader, ReturnConfig
 from egovcp.errors import UsageError
-from egovcp.spec import ACTION_BOX, ACTION_NAMES
+from egovcp.spec import ACTION_BOX, ACTION_NAMES, REWARD_TERMS
 from egovcp_collect.dataset.task_data import (
     DepthStatistics,
     TaskRows,
@@ -26,10 +27,11 @@ from egovcp_collect.dataset.task_data import (
     sample_episodes,
 )
 
-EVENT_REWARD: Final = 0.05  # events count 1, poses at most 0.02
 #: Reward terms of a success, and of a failure.
 GOOD_TERMS: Final = ("block", "pass")
 BAD_TERMS: Final = ("hit", "fall")
+_EVENT_COLUMNS: Final = [REWARD_TERMS.index(name) for name in (*GOOD_TERMS, *BAD_TERMS)]
+EVENT_REWARD: Final = 0.08  # events count 1, the costs of pose and action rate at most 0.07
 HISTOGRAM_BINS: Final = 40
 """Bins of an action's histogram, over [-1, 1]."""
 GRID_CELLS: Final = 8
@@ -65,7 +67,7 @@ class EventRate:
     """How often an event occurred."""
 
     ticks: int
-    per_1000_steps: float  # ticks
+    per_1000_ticks: float
     episodes: int
     episode_share: float  # of all episodes of the task
 
@@ -78,8 +80,8 @@ class ReturnStatistics:
     steps: int  # horizon K, planner ticks
     valid_share: float  # rows whose return the time limit does not cut short
     spread: Distribution | None
-    positive_share: float  # valid rows with an event row above the median within the horizon
-    negative_share: float  # valid rows with an event row below the median within the horizon
+    positive_share: float  # valid rows with a positive event row within the horizon
+    negative_share: float  # valid rows with a negative event row within the horizon
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,8 @@ class ActionStatistics:
 
     histogram: dict[str, list[int]]  # action name -> rows per bin
     uniformity: dict[str, float]
-    """Action name -> overlap of its histogram p over n bins with the even one, sum of
-    min(p_i, 1 / n): 1 is even, 1 / n is a single bin."""
+    """Action name -> overlap of its histogram p over n bins with the uniform one, sum of
+    min(p_i, 1 / n): 1 is uniform, 1 / n is a single bin."""
     occupied: dict[str, float]  # hand -> share of the grid cells that hold an action
     workspace_m: dict[str, tuple[float, float]]
     """Action name -> lowest and highest target, m, pelvis heading frame (height: above
@@ -230,17 +232,19 @@ def _return_statistics(rows: TaskRows, config: ReturnConfig) -> ReturnStatistics
 
 
 def events_ahead(rows: TaskRows, steps: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(N,) and (N,): whether an event row above, or below, the median reward is among the next
-    ``steps`` rows of the episode, including the row itself."""
-    deviation = rows.reward - np.median(rows.reward)
+    """(N,) and (N,): whether a positive, or negative, event row is among the next ``steps`` rows of
+    the episode, including the row itself."""
+    events, least = rows.reward_terms[:, _EVENT_COLUMNS], 0.0
+    if not rows.reward_terms.any():  # not recorded
+        events, least = (rows.reward - np.median(rows.reward))[:, None], EVENT_REWARD
     end = np.repeat(rows.start + rows.length, rows.length)
-    here = np.arange(len(deviation))
+    here = np.arange(len(events))
 
     def ahead(event: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        before = np.concatenate([[0], event.cumsum()])
+        before = np.concatenate([[0], event.any(axis=1).cumsum()])
         return np.asarray(before[np.minimum(here + steps, end)] > before[here])
 
-    return ahead(deviation > EVENT_REWARD), ahead(deviation < -EVENT_REWARD)
+    return ahead(events > least), ahead(events < -least)
 
 
 def drawn_parameters(metadata: Sequence[Mapping[str, Any]]) -> dict[str, Distribution]:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,7 +33,7 @@ from egovcp.errors import DataError
 _SAMPLED_FRAMES: Final = 20  # for the statistics of a camera that are not recorded
 
 
-type Spans = dict[int, dict[str, VideoSpan]]
+type Spans = Mapping[int, Mapping[str, VideoSpan]]
 """Number of an episode -> its part of each video."""
 
 
@@ -50,12 +51,13 @@ class SoundEpisode:
 def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
     """Each sound episode once, in the order of the data files, and the problems of the others.
 
-    What the tables lack is taken from the data: tasks from the episodes that name one task, and the
-    place of an episode in the videos if these hold the frames of all episodes and no others.
+    What the tables lack is taken from the data: ``reader.tasks`` from the episodes that name one
+    task, and the place of an unlisted episode in the videos if these hold the frames of all
+    episodes and no others.
     """
     check = LeRobotCheck(reader, every=True)
     columns = [k for k, f in reader.features.items() if f.dtype != "video"]
-    spans = _rebuilt_spans(reader)
+    spans = cache(partial(_rebuilt_spans, reader))
     reader.tasks = reader.tasks or _named_tasks(reader)
     seen = set[int]()
     for path in reader.data_files:
@@ -78,10 +80,11 @@ def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
 
 
 def _examine(
-    check: LeRobotCheck, spans: Spans, path: Path, number: int, table: pa.Table
+    check: LeRobotCheck, spans: Callable[[], Spans], path: Path, number: int, table: pa.Table
 ) -> Iterator[SoundEpisode | DataError]:
     row = check.by_number.get(number) or EpisodeRow(path, number, 0, 0, 0, path)
-    row = replace(row, videos=spans.get(number, row.videos))
+    if check.reader.keys("video"):
+        row = replace(row, videos=row.videos or spans().get(number, {}))
     if missing := sorted(set(check.reader.keys("video")) - set(row.videos)):
         problem = "meta/episodes does not list it, and the videos do not tell where it is"
         yield DataError.at(path, f"{problem} in {missing[0]}", number)
@@ -106,33 +109,30 @@ def _named_tasks(reader: LeRobotReader) -> dict[int, str]:
 
 
 def _rebuilt_spans(reader: LeRobotReader) -> Spans:
-    """Episode -> where each video shows it, if the video files, in order, hold all episodes one
-    after another; of other cameras nothing."""
+    """Episode -> where each video shows it; empty unless every camera's files, in order, hold
+    exactly all episodes."""
     lengths: dict[int, int] = {}
-    spans: Spans = {}
-    videos = reader.keys("video")
-    for path in reader.data_files if videos else ():
+    spans: dict[int, dict[str, VideoSpan]] = {}
+    for path in reader.data_files:
         for part in reader.episodes(path, ["episode_index"]):
             if not isinstance(part, DataError):
                 lengths[part[0]] = lengths.get(part[0], 0) + len(part[1])
-    for key in videos:
+    for key in reader.keys("video"):
         waiting = list(lengths.items())
-        placed: dict[int, VideoSpan] = {}
         try:
             for path in files_below(reader.root / "videos" / key):
                 times, used = frame_times(path), 0
                 while waiting and used + waiting[0][1] <= len(times):
                     number, length = waiting.pop(0)
-                    placed[number] = VideoSpan(path, float(times[used]))
+                    spans.setdefault(number, {})[key] = VideoSpan(path, float(times[used]))
                     used += length
                 if used != len(times):
                     raise DataError.at(path, "holds other frames")
         except DataError:
-            continue
-        if not waiting:
-            for number, span in placed.items():
-                spans.setdefault(number, {})[key] = span
-    return {n: found for n, found in spans.items() if len(found) == len(videos)}
+            return {}
+        if waiting:
+            return {}
+    return spans
 
 
 class SubsetWriter:
@@ -307,8 +307,11 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
     episodes and frames.
 
     Raises:
-        DataError: one of them has a problem.
+        DataError: one of them has a problem, or the numbers are not 0 to N - 1.
     """
+    if [row.index for row in reader.rows] != list(range(len(reader.rows))):
+        problem = "its episodes are not numbered from 0 without gaps"
+        raise DataError(f"{reader.root}: {problem}; `egovcp-dataset repair` renumbers them")
     wanted = set(episodes)
     with new_dataset(root) as folder:
         writer = SubsetWriter(reader, folder)

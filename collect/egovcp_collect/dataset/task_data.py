@@ -20,6 +20,7 @@ _COLUMNS: Final = (
     spec.DONE_KEY,
     spec.SUCCESS_KEY,
     spec.TRUNCATED_KEY,
+    spec.REWARD_TERMS_KEY,
 )
 _SAMPLED_EPISODES: Final = 12  # of each task
 _SHOWN_EPISODES: Final = 2  # of each task
@@ -38,6 +39,7 @@ class TaskRows:
     metadata: Sequence[Mapping[str, Any]]  # (E,)
     action: NDArray[np.float32]  # (N, 7) box units
     reward: NDArray[np.float32]  # (N,)
+    reward_terms: NDArray[np.float32]  # (N, 6) `spec.REWARD_TERMS`; zeros if not recorded
     fallen: NDArray[np.bool_]  # (E,) the episode ended in a fall
     success: NDArray[np.bool_]  # (E,) in the last row
     mc_return: NDArray[np.float32]  # (N,) Monte Carlo return
@@ -50,7 +52,7 @@ class TaskRows:
 
 
 def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
-    """The rows of each task in the dataset, in the order of their first episodes; 50 bytes per row.
+    """The rows of each task in the dataset, in the order of their first episodes; 74 bytes per row.
 
     Raises:
         DataError: a file is damaged.
@@ -63,7 +65,7 @@ def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
         length = reader.lengths[episodes]
         last = length.cumsum() - 1
         rows = np.repeat(tasks == task, reader.lengths)
-        action, reward, done, success, truncated = (columns[key][rows] for key in _COLUMNS)
+        action, reward, done, success, truncated, terms = (columns[k][rows] for k in _COLUMNS)
         rewards = np.split(reward, last[:-1] + 1)
         valid = [
             mc_valid(n, reader.time_limit(i), returns.steps, returns.keep_truncated)
@@ -77,6 +79,7 @@ def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
                 metadata=[reader.metadata(i) for i in episodes.tolist()],
                 action=action,
                 reward=reward,
+                reward_terms=terms,
                 fallen=is_terminal(done, truncated)[last],
                 success=success[last],
                 mc_return=np.concatenate(

@@ -18,8 +18,8 @@ from egovcp.sim.tasks import (
 )
 
 RADIUS = 0.05  # m
-ABOVE = 0.10  # m, of the ball above the plane of the arm
-AWAY = (0.0, 0.0, -1.0)  # m, below the table
+BALL_ABOVE_ARM = 0.10  # m, height of the ball above the plane of the arm
+HIDDEN_POSITION = (0.0, 0.0, -1.0)  # m, below the table
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ReachTaskConfig(TaskConfig):
     tolerance: float = bounded(0.06, above=0, most=1)
     """Horizontal distance of the tip from the ball that counts as reached, m."""
     near_reward: float = bounded(0.2, least=0, most=1000)
-    """Per planner tick below the ball; it decays by 1/e every `scale`."""
+    """Per planner tick below the ball; it falls by a factor of e per `scale` of distance."""
     scale: float = bounded(0.1, above=0, most=10)
     """Distance over which the reward decays, m."""
 
@@ -45,24 +45,24 @@ class ReachTask(RobotTask):
     name = "arm_reach"
     description = "reach below a ball that appears above the table"
     event = "ball appears"
-    terms = {"near": "pass"}
+    terms = {"near": "pass"}  # reward term: its column in the dataset
     config: ReachTaskConfig = ReachTaskConfig()
     episode = EpisodeConfig(ticks=60, event_ticks=(2, 15))
     short_episode = EpisodeConfig(ticks=50, event_ticks=(0, 6), empty_probability=0.05)
 
     def __init__(self, config, scenario, robot) -> None:
         super().__init__(config, scenario, robot)
-        where = self.sample("distance", "bearing")
+        where = self.sample("distance", "bearing")  # from distance_range and bearing_range
         x = where["distance"] * math.cos(where["bearing"])
         y = where["distance"] * math.sin(where["bearing"])
-        self._goal = np.array([x, y, HEIGHT + ABOVE])
+        self._goal = np.array([x, y, HEIGHT + BALL_ABOVE_ARM])
         self._shown = False
         self._angles = np.zeros(3)
 
     @classmethod
     def add_objects(cls, spec: mujoco.MjSpec) -> None:
         """The ball, which nothing touches."""
-        ball = spec.worldbody.add_body(name="ball", mocap=True, pos=AWAY)
+        ball = spec.worldbody.add_body(name="ball", mocap=True, pos=HIDDEN_POSITION)
         ball.add_geom(
             name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[RADIUS, 0, 0], contype=0,
             conaffinity=0,
@@ -70,7 +70,7 @@ class ReachTask(RobotTask):
 
     def place(self) -> None:
         """The ball is below the table until the event."""
-        self.robot.data.mocap_pos[0] = AWAY
+        self.robot.data.mocap_pos[0] = HIDDEN_POSITION
 
     def before_step(self) -> None:
         if self.since_event >= 0 and not self._shown:

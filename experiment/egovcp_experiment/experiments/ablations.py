@@ -1,4 +1,4 @@
-"""Held-out figures of world models with single choices changed.
+"""Held-out metrics of world models with single choices changed.
 
 One model per choice, with equal steps and seeds, on the data of all tasks together.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from egovcp.errors import UsageError
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.grid import ALL, Grid
@@ -15,10 +16,10 @@ from egovcp_experiment.report import ExperimentReport, Table
 
 #: Ablations that are presets of egovcp-train.
 _PRESETS: Final = (
-    *("paper", "kl_equal", "kl_tenfold", "no_free_nats", "free_nats_per_dimension"),
-    *("pixels_summed", "state_summed", "state_1", "no_moving", "no_multistep", "no_near"),
-    *("value_weight_1", "q_of_posterior_only", "no_object", "monte_carlo", "no_sampled_actions"),
-)
+    "paper", "kl_equal", "kl_tenfold", "no_free_nats", "free_nats_per_dimension", "pixels_summed",
+    "state_summed", "state_1", "no_moving", "no_multistep", "no_near", "value_weight_1",
+    "q_of_posterior_only", "no_object", "monte_carlo", "no_sampled_actions",
+)  # fmt: skip
 #: Choice -> changed flags of egovcp-train.
 CHOICES: Final[dict[str, Flags]] = {
     "default": {},
@@ -33,7 +34,16 @@ CHOICES: Final[dict[str, Flags]] = {
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
+    """Request the cells of all choices; report those in ``records``.
+
+    Raises:
+        UsageError: a preset is given, which those of the choices would replace.
+    """
     config = grid.config
+    if config.train.preset != "default" and config.scale != "smoke":
+        raise UsageError(
+            f"--train.preset={config.train.preset}: ablations choose presets themselves; drop it"
+        )
     trained_on = ALL if len(config.tasks) > 1 else config.tasks[0]
     trainings = {
         name: [
@@ -46,7 +56,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     }
     page = ExperimentReport(
         "Ablations: what each choice of the world model is worth on held-out episodes",
-        parts=[
+        sections=[
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
             "(x): times below the error of repeating the last image, at that many ticks "
@@ -60,8 +70,8 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             for name, cells in trainings.items()
             if (row := results.heldout(records, cells, task))
         }
-        page.shows += _conclusions(task, rows)
-        page.parts.append(_table(task, rows))
+        page.findings += _conclusions(task, rows)
+        page.sections.append(_table(task, rows))
         page.figures[task] = rows
     return page
 

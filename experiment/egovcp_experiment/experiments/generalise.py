@@ -118,7 +118,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     chosen = _chosen(grid.config)
     page = ExperimentReport(
         "Generalisation: scenes that no model was trained on",
-        parts=[
+        sections=[
             "The model knows scenes `as_trained` only. All conditions draw the same scenarios, so "
             "that differences are paired. `hold` and `oracle` (scripted, with the simulator's "
             "state and the same delays) show how hard a condition is: where the oracle fails, too, "
@@ -126,7 +126,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ],
     )
     if SequenceTask.name in chosen:
-        page.parts.append(
+        page.sections.append(
             "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
             "played by the same model, whose input names neither tasks nor times. Each part draws "
             "what its task draws alone; parts after a fall are failures."
@@ -144,10 +144,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
                 references[name] = results.controller_scores(records, cell, task, _REFERENCES)
         base = next(iter(row))
         if base in planner:
-            page.parts.append(_table(task, planner, references, row))
+            page.sections.append(_table(task, planner, references, row))
             plot = results.comparison_plot(f"conditions-{task}", task, planner, base)
-            page.parts.append(plot)
-            page.shows += _conclusions(task, planner)
+            page.sections.append(plot)
+            page.findings += _conclusions(task, planner)
         page.figures[task] = {
             name: results.figures_of({"planner": scores, **references[name]})
             for name, scores in planner.items()

@@ -51,16 +51,16 @@ def _add_value_maps(page: ExperimentReport, task: str, found: Mapping[str, Any])
         for name, row in summary.items()
     ]
     head = ("flight", "episodes", "best - worst (deviations of the return)", "height error (cm)")
-    page.parts += [
+    page.sections += [
         "Q of the planned action with the target of that hand moved over its x-z plane, all else "
         "equal. Height error: between the best point of the map and the height of the ball's aim.",
         Table("Value map of the hand on the ball's side, means over episodes", head, rows),
     ]
     if found["maps"]:
-        page.parts.append(_map_plot(found))
+        page.sections.append(_map_plot(found))
     if {"before", "75%"} <= summary.keys():
         before, late = summary["before"], summary["75%"]
-        page.shows.append(
+        page.findings.append(
             f"{task}: the value map of a hand spans {before['spread']:.2f} deviations "
             f"of the return before the throw and {late['spread']:.2f} at 75 % of the flight; the "
             f"best point is {100 * before['height_error_m']:.0f} and "
@@ -109,15 +109,15 @@ def _add_open_loop(page: ExperimentReport, task: str, found: Mapping[str, Any]) 
     )
     columns = ("model", "repeat", "model_moving", "repeat_moving")
     rows = [(k, *(_centimetres(row[c]) for c in columns)) for k, row in errors.items()]
-    page.parts.append(Table(title, head, rows))
+    page.sections.append(Table(title, head, rows))
     if last["model_moving"] is not None:
-        page.shows.append(
+        page.findings.append(
             f"{task}: {HORIZONS[-1]} ticks ahead, the error on moving pixels is "
             f"{100 * last['model_moving']:.0f} cm, that of repeating the last image "
             f"{100 * last['repeat_moving']:.0f} cm"
         )
     if found["strips"]:
-        page.parts.append(_strip_plot(task, found["strips"]))
+        page.sections.append(_strip_plot(task, found["strips"]))
 
 
 def _centimetres(metres: float | None) -> str:
@@ -141,7 +141,7 @@ def _strip_plot(task: str, strips: Sequence[Mapping[str, Any]]) -> Plot:
     return draw(f"open-loop-{task}", caption, paint, (9.0, 0.3 + 0.85 * 2 * len(strips)))
 
 
-#: Figure of the study -> its name in the table.
+#: Metric of the study -> its name in the table.
 _BEHAVIOUR: Final = {
     "empty_scene": "distance of the hands from their start, no event (cm)",
     "before_throw": "distance of the hands from their start, before the throw (cm)",
@@ -168,8 +168,8 @@ def _add_behaviour(page: ExperimentReport, task: str, found: Mapping[str, Any]) 
                 low, high = row["ci95"]
                 shown = (f"{100 * row['mean']:.1f}", f"{100 * low:.1f} to {100 * high:.1f}")
             rows.append((name, *shown, str(row["episodes"])))
-    page.parts.append(Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), rows))
-    page.shows += _behaviour_conclusion(task, found)
+    page.sections.append(Table(f"{task}: behaviour", ("", "mean", "95 %", "episodes"), rows))
+    page.findings += _behaviour_conclusion(task, found)
 
 
 def _behaviour_conclusion(task: str, found: Mapping[str, Any]) -> list[str]:

@@ -20,7 +20,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     page = ExperimentReport(
         "Multi-task: one model on mixed data against one for each task",
-        parts=[_introduction(config)],
+        sections=[_introduction(config)],
     )
     tables: list[Part] = []
     levels: dict[str, dict[str, float]] = {}
@@ -36,19 +36,19 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         if scores:
             tables.append(results.comparison(task, {**scores, **references}, "single"))
         if len(scores) == 2:
-            page.shows.append(_conclusion(task, scores))
+            page.findings.append(_conclusion(task, scores))
         if {"oracle", "random"} <= references.keys():
             levels[task] = {name: _level(each, references) for name, each in scores.items()}
             page.figures[task]["normalised"] = levels[task]
     if levels:
-        page.parts.append(_levels_plot(levels))
-    page.parts += tables
+        page.sections.append(_levels_plot(levels))
+    page.sections += tables
     episodes = min(config.play.episodes, _LATENT_EPISODES)
     cell = grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
     if cell in records:
         latents = records[cell]["figures"]
-        page.parts.append(_maps(latents))
-        page.shows.append(_separation(latents))
+        page.sections.append(_maps(latents))
+        page.findings.append(_separation(latents))
         page.figures["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }

@@ -29,7 +29,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     page = ExperimentReport(
         "Planners: searches in equal time, and rules after a failure",
-        parts=[
+        sections=[
             "Searches: each has the largest number of candidates with a plan time below "
             f"{config.play.budget_ms:g} ms on the machine below; all searches were timed in turns. "
             "The number of elites is the planner's, at most half of the candidates. "
@@ -47,15 +47,15 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         rules = results.all_scores(records, rule_plays, task)
         timing = records.get(f"plan_time-{task}")
         if timing is not None:
-            page.parts.append(_timings(task, timing["figures"]["searches"], searches))
+            page.sections.append(_timings(task, timing["figures"]["searches"], searches))
         for kind, scores, reference in (("searches", searches, "cem"), ("rules", rules, "default")):
             if scores:
                 title = f"{task}: {kind}"
-                page.parts += [
+                page.sections += [
                     results.comparison(title, scores, reference),
                     results.comparison_plot(f"{task}-{kind}", title, scores, reference),
                 ]
-                page.shows += _conclusions(task, kind, scores, reference)
+                page.findings += _conclusions(task, kind, scores, reference)
         named = {f"search_{name}": each for name, each in searches.items()}
         page.figures[task] = results.figures_of({**named, **rules})
     return page

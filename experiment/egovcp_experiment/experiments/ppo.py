@@ -68,7 +68,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         raise UsageError("--ppo.steps=0 leaves PPO out; expected at least 1 here")
     page = ExperimentReport(
         "PPO, without a model, next to the planner",
-        parts=[
+        sections=[
             f"PPO was trained in the simulator for {config.ppo.transitions[-1]} transitions of "
             "each task, with the observation, actions, rewards, delays and noise of the planner, "
             f"and played as it was after {', '.join(map(str, config.ppo.transitions))}. The "
@@ -88,11 +88,11 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             if planner is not None:
                 curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
             caption = f"{task}: success and reward against transitions"
-            page.parts.append(results.learning_curves(task, caption, curves))
-            page.shows += _conclusions(task, offline, planner, ppo, bounds)
+            page.sections.append(results.learning_curves(task, caption, curves))
+            page.findings += _conclusions(task, offline, planner, ppo, bounds)
             page.figures[task] = {"planner_transitions": offline}
         if shown:
-            page.parts.append(results.comparison(task, shown, _PLANNER))
+            page.sections.append(results.comparison(task, shown, _PLANNER))
             page.figures.setdefault(task, {}).update(results.figures_of(shown))
     return page
 

@@ -19,7 +19,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     grid.collected = max(1.0, *config.data.parts)
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
-        parts=[
+        sections=[
             f"Every model was trained for {config.train.budget} on the first episodes of one "
             "random dataset, whatever their number; a twentieth of them is held out. The "
             "model-free baseline (PPO, dashed) collects its transitions while it learns: its curve "
@@ -30,7 +30,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     curves: list[results.Curve] = []
     ppo_curves: list[results.Curve] = []
     for task in config.tasks:
-        models = {part: _model(grid, task, part) for part in config.data.parts}
+        models = {part: _model(grid, task, part) for part in sorted(config.data.parts)}
         plays = {part: grid.plays(task, m.name, model=m) for part, m in models.items()}
         bounds = grid.bounds(task)
         ppo = ppo_scores(grid, task, records)
@@ -50,13 +50,13 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             **results.controller_scores(records, bounds, task, BOUNDS),
         }
         tables.append(results.comparison(task, shown, list(named)[-1]))
-        page.shows.append(_conclusion(task, named))
+        page.findings.append(_conclusion(task, named))
         page.figures[task] = results.figures_of(shown)
     if curves:
         caption = "Success and reward against transitions"
         plot = results.learning_curves("transitions", caption, curves + ppo_curves)
-        page.parts.append(plot)
-    page.parts += tables
+        page.sections.append(plot)
+    page.sections += tables
     return page
 
 

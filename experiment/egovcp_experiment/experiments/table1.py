@@ -174,22 +174,22 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         {"claims": [v.figures() for v in verdicts]},
     )
     if scores:
-        page.parts.append(_summary(scores))
+        page.sections.append(_summary(scores))
     if verdicts:
         head = (
             *("the paper's claim", "task", "here", "success (points)", "95 %", "reward/step"),
             *("95 %", "trainings", "the paper's reward"),
         )
         title = "Differences, above - below, on the same scenarios"
-        page.parts.append(Table(title, head, [verdict.row() for verdict in verdicts]))
+        page.sections.append(Table(title, head, [verdict.row() for verdict in verdicts]))
     for task in config.tasks:
         cell = grid.bounds(task)
         if task in scores:
             bounds = results.controller_scores(records, cell, task, BOUNDS)
             titled = {ROWS[name].title: each for name, each in scores[task].items()}
             ours = ROWS[OURS].title
-            page.parts.append(results.comparison(task, {**titled, **bounds}, ours))
-            page.parts.append(results.comparison_plot(task, task, titled, ours))
+            page.sections.append(results.comparison(task, {**titled, **bounds}, ours))
+            page.sections.append(results.comparison_plot(task, task, titled, ours))
             page.figures[task] = results.figures_of({**scores[task], **bounds})
     return page
 

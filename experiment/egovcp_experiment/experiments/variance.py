@@ -10,31 +10,37 @@ import numpy as np
 
 from egovcp.eval_scores import EvalScores, signed_range
 from egovcp_experiment import results
-from egovcp_experiment.grid import Grid
+from egovcp_experiment.grid import Grid, parse_flags
 from egovcp_experiment.report import ExperimentReport, Plot, Table, draw
 from egovcp_experiment.studies.residuals import STEPS
 
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
-_WALK: Final = ("--eta", "--step_ticks", "--boundary")  # flags of egovcp-collect
+#: The random walk of `egovcp-collect` by default, as flags; that of its preset `paper` is the
+#: default of the study.
+_COLLECT_WALK: Final = {"eta": "1.0", "step_ticks": "[5,15]", "boundary": "reflect"}
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    walk = [flag for flag in config.data.flags if flag.partition("=")[0] in _WALK]
+    given = parse_flags(config.data.flags)
+    walk = {} if given.get("preset") == "paper" else _COLLECT_WALK
+    walk = walk | {name: given[name] for name in _COLLECT_WALK if name in given}
     page = ExperimentReport(
         "Variance: do the errors of Q along a plan average out?",
-        parts=[
+        sections=[
             "Residuals are Q along an imagined plan minus the mean return of random walks that the "
             "simulator takes from the same step of the same plan; the variance of that mean is "
             "taken off. Bounds use the largest correlation between two steps and the least and "
             "largest variance, as in the paper. `cutting`: returns as in training minus returns to "
-            "the end of the episode."
+            "the end of the episode. By default Q is trained on the privileged value of planned "
+            "actions, not on returns of random walks: only for models trained with "
+            "`--policy.loss.q_target=mc` does the comparison test the paper's claim."
         ],
     )
     for task in config.tasks:
         flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
-        cell = grid.sim_study("residuals", task, flags, walk)
+        cell = grid.sim_study("residuals", task, {**flags, **walk})
         plays = {n: grid.plays(task, f"horizon_{n}", {"planner.horizon": n}) for n in _HORIZONS}
         scores = results.all_scores(records, plays, task)
         page.figures[task] = {"horizons": results.figures_of(scores)}
@@ -42,13 +48,13 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             plans = records[cell]["figures"]["plans"]
             page.figures[task]["residuals"] = plans
             known = {kind: row for kind, row in plans.items() if "horizons" in row}
-            page.parts += [_table(task, kind, row) for kind, row in known.items()]
+            page.sections += [_table(task, kind, row) for kind, row in known.items()]
             if known and scores:
-                page.parts.append(_plot(task, known, scores))
-            page.shows += _conclusions(task, known, scores)
+                page.sections.append(_plot(task, known, scores))
+            page.findings += _conclusions(task, known, scores)
         if scores:
             rows = {f"N = {n}": each for n, each in scores.items()}
-            page.parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
+            page.sections.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
     return page
 
 

@@ -81,7 +81,7 @@ type Traces = list[BehaviourTrace]
 
 
 def measure(config: BehaviourConfig) -> None:
-    """Play scenes with and without an event, and write the figures."""
+    """Play scenes with and without an event, and write the metrics."""
     config.require_task(TASKS)
     artifact = config.load()
     eventful = _traces(artifact, config.env, config)

@@ -47,7 +47,7 @@ class ResidualsConfig(study.SimStudyConfig):
     """Errors of Q along plans, one plan of each kind per episode."""
 
     branches: int = bounded(12, least=2)
-    """Random walks per step of a plan; their mean return is the target of Q."""
+    """Random walks per step of a plan; their mean return is what Q is compared with."""
     eta: float = bounded(ACTION_ETA, above=0, most=2)
     """Step size of the data's random walk, as in egovcp-collect."""
     step_ticks: tuple[int, int] = bounded((1, 1), least=1)

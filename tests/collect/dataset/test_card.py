@@ -17,7 +17,7 @@ from egovcp.errors import UsageError
 from egovcp.help_text import field_docs
 from egovcp.sim.tasks import task_names
 from egovcp_collect.dataset import card
-from egovcp_collect.dataset.card import CardConfig, card_text, settings_tables
+from egovcp_collect.dataset.card import CardConfig, _size_category, card_text, settings_tables
 from egovcp_collect.dataset.cli import main
 
 from .conftest import write
@@ -46,6 +46,15 @@ def test_front_matter_is_valid(carded: DatasetReader) -> None:
     assert data.task_categories == ["robotics"]
     assert {"LeRobot", "egovcp", "unitree_g1", "depth"} <= set(data.tags)
     assert data.configs == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+
+
+def test_an_id_without_a_user_is_refused(carded: DatasetReader) -> None:
+    assert main(["card", str(carded.root), "--repo_id=three"]) == 2
+
+
+def test_size_categories_are_those_of_the_hub() -> None:
+    names = [_size_category(rows) for rows in (999, 1000, 10**7 - 1, 10**7)]
+    assert names == ["n<1K", "1K<n<10K", "1M<n<10M", "10M<n<100M"]
 
 
 def test_the_schema_is_complete(text: str) -> None:

@@ -115,6 +115,26 @@ def test_impossible_edits_are_refused(
     assert not output.exists()
 
 
+def test_a_gap_in_the_numbers_is_refused_and_repaired(
+    others: dict[str, Path], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(others["arm"], tmp_path / "copy"))
+    of_table(episode_index=lambda v: v.__setitem__(3, 5))(root)
+    rows_of(d.DATA, episode_index=lambda v: v.__setitem__(slice(27, 36), [5] * 9))(root)
+    assert main(["delete", str(root), "--episodes=[2]", f"--output_dir={tmp_path / 'less'}"]) == 3
+    assert not (tmp_path / "less").exists()
+    assert main(["repair", str(root), f"--output_dir={tmp_path / 'new'}"]) == 0
+    same_frames(tmp_path / "new", others["arm"], [0, 1, 2, 3])
+
+
+def test_videos_are_not_read_to_find_listed_episodes(
+    others: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("egovcp_collect.dataset.subset.frame_times")
+    output = tmp_path / "less"
+    assert main(["delete", str(others["arm"]), "--episodes=[1]", f"--output_dir={output}"]) == 0
+
+
 @pytest.mark.parametrize(
     ("damage", "kept"),
     [

@@ -1,12 +1,13 @@
 """Statistics of datasets with known content."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader, EpisodeStore, ReturnConfig
-from egovcp.spec import ACTION_BOX, ACTION_NAMES, reflect
+from egovcp.spec import ACTION_BOX, ACTION_NAMES, REWARD_TERMS, reflect
 from egovcp_collect.dataset.statistics import (
     GRID_CELLS,
     HISTOGRAM_BINS,
@@ -62,12 +63,24 @@ def test_events_ahead_equal_a_search_of_each_window(reader: DatasetReader) -> No
             assert bad[span].tolist() == [bool((w < 0).any()) for w in windows]
 
 
+def test_events_ahead_come_from_recorded_terms_not_from_action_costs(tmp_path: Path) -> None:
+    terms = np.zeros((LENGTH, len(REWARD_TERMS)), np.float32)
+    terms[20, REWARD_TERMS.index("action_rate")] = -0.1
+    terms[40, REWARD_TERMS.index("hit")] = -1.0
+    terms[60, REWARD_TERMS.index("block")] = 1.0
+    costs = replace(scene(0), reward=terms.sum(axis=1), reward_terms=terms)
+    (rows,) = read_rows(write_scenes(tmp_path / "terms", [costs]), RETURNS)
+    good, bad = events_ahead(rows, RETURNS.steps)
+    assert np.flatnonzero(good).tolist() == [*range(51, 61)]
+    assert np.flatnonzero(bad).tolist() == [*range(31, 41)]
+
+
 def test_events_are_counted_per_tick_and_per_episode(found: DatasetStatistics) -> None:
     ball = found.tasks[0]
     steps = 2 * LENGTH + 41
     block, hands = ball.events["block"], ball.events["touch.hands"]
     assert (block.ticks, block.episodes) == (1, 1)
-    assert block.per_1000_steps == pytest.approx(1000 / steps)
+    assert block.per_1000_ticks == pytest.approx(1000 / steps)
     assert block.episode_share == pytest.approx(1 / 3)
     assert (hands.ticks, hands.episodes) == (3, 1)
     assert (ball.event_episodes, ball.good_episodes, ball.bad_episodes) == (2, 1, 1)

@@ -64,9 +64,10 @@ def test_reflection_is_a_mirror() -> None:
     np.testing.assert_allclose(reflect(np.array([-1.3, 0.4, 1.2])), [-0.7, 0.4, 0.8])
 
 
-def test_constants_need_seven_numbers() -> None:
-    with pytest.raises(UsageError, match="expected 7"):
-        Constant([0.0] * 3)
+def test_constants_need_seven_numbers(env: VectorEnv) -> None:
+    env.reset([Scenario("ball", 0, i) for i in range(env.num_envs)])
+    with pytest.raises(UsageError, match="expected actions of shape"):
+        env.step(Constant([0.0] * 3).act(env))
 
 
 def outcome(env: VectorEnv, policy: EnvPolicy, task: str) -> tuple[float, float]:

@@ -102,7 +102,7 @@ def played(name: str, success: int, reward: float) -> Mapping[str, Any]:
 
 def test_conclusions_follow_from_the_scores() -> None:
     records = {
-        "collect-ball-1334": {"figures": {"episodes": 1334, "steps": 200_100}},
+        "collect-ball-5400": {"figures": {"episodes": 5400, "steps": 200_100}},
         "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
         "play-ball-ppo_500-s3": {"figures": {"ball": played("ppo", 5, 0.2)}},
         "play-ball-ppo_1000-s3": {"figures": {"ball": played("ppo", 10, 0.2)}},
@@ -116,14 +116,14 @@ def test_conclusions_follow_from_the_scores() -> None:
             }
         },
     }
-    shows = PPO.report(CONFIG, records).shows
-    assert shows[0].startswith(
+    findings = PPO.report(CONFIG, records).findings
+    assert findings[0].startswith(
         "ball: the planner 90.0 % success from 200k steps, PPO 50.0 % after 1000 steps: PPO is "
         "worse (reward per step -0.08000, 95 % -0.08000 to -0.08000; success -40.0 points"
     )
-    assert shows[1].startswith(
+    assert findings[1].startswith(
         "ball: compared with the neutral pose, PPO is better (reward per step +0.01000"
     )
-    assert shows[2].startswith(
+    assert findings[2].startswith(
         "ball: compared with its first policy, PPO's last is no different beyond"
     )

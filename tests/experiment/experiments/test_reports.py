@@ -68,29 +68,29 @@ def report(name: str, share: float) -> ExperimentReport:
 def test_every_report_works_without_results(name: str) -> None:
     found = EXPERIMENTS[name].report(SCALES["small"](), {})
     assert found.title
-    assert found.shows == []
-    assert not [part for part in found.parts if isinstance(part, Plot)]
+    assert found.findings == []
+    assert not [part for part in found.sections if isinstance(part, Plot)]
 
 
 @pytest.mark.parametrize("share", [0.4, 1.0])
 @pytest.mark.parametrize("name", CLOSED_LOOP)
 def test_tables_agree_with_their_heads(name: str, share: float) -> None:
     found = report(name, share)
-    tables = [part for part in found.parts if isinstance(part, Table)]
+    tables = [part for part in found.sections if isinstance(part, Table)]
     assert tables
     for table in tables:
         assert table.rows
         assert {len(row) for row in table.rows} == {len(table.head)}
-    plots = [part for part in found.parts if isinstance(part, Plot)]
+    plots = [part for part in found.sections if isinstance(part, Plot)]
     assert len({plot.name for plot in plots}) == len(plots)
 
 
 @pytest.mark.parametrize("name", CLOSED_LOOP)
 def test_every_task_has_a_conclusion(name: str) -> None:
-    shows = " ".join(report(name, 1.0).shows)
+    findings = " ".join(report(name, 1.0).findings)
     if name != "variance":  # its verdicts need residuals
         for task in ("ball", "wall", "arch"):
-            assert f"{task}" in shows
+            assert f"{task}" in findings
 
 
 def test_a_significant_loss_is_reported() -> None:
@@ -100,9 +100,9 @@ def test_a_significant_loss_is_reported() -> None:
         if cell.command is PLAY and cell.flags["controllers"] == "planner":
             row = found[cell.name]["figures"][cell.flags["task"]]["planner"]["played"]
             row["success"] = [True] * 20 if "box" not in cell.name else [False] * 10 + [True] * 10
-    shows = EXPERIMENTS["generalise"].report(SCALES["small"](), found).shows
-    assert "ball: worse by more than chance, points: `box` -50" in shows
-    assert not [line for line in shows if line.startswith("wall: worse")]
+    findings = EXPERIMENTS["generalise"].report(SCALES["small"](), found).findings
+    assert "ball: worse by more than chance, points: `box` -50" in findings
+    assert not [line for line in findings if line.startswith("wall: worse")]
 
 
 def generalised(**options: Any) -> list[Cell]:
@@ -144,8 +144,10 @@ def test_only_chosen_conditions_and_their_reference_are_played() -> None:
 
 def test_the_report_has_the_parts_of_a_sequence() -> None:
     found = report("generalise", 1.0)
-    assert [line for line in found.shows if line.startswith("sequence: parts won in")]
-    table = next(p for p in found.parts if isinstance(p, Table) and p.title.startswith("sequence"))
+    assert [line for line in found.findings if line.startswith("sequence: parts won in")]
+    table = next(
+        p for p in found.sections if isinstance(p, Table) and p.title.startswith("sequence")
+    )
     assert {"planner's arch", "planner's ball", "planner's wall"} <= set(table.head)
     wall = table.head.index("planner's wall")
     assert [row[wall] == "-" for row in table.rows] == [True, True, False]
@@ -155,7 +157,7 @@ def test_multitask_names_the_models_that_were_not_trained() -> None:
     def words(policies: dict[str, str]) -> str:
         small = SCALES["small"]()
         config = replace(small, train=replace(small.train, policies=policies))
-        return str(EXPERIMENTS["multitask"].report(config, records("multitask", 1.0)).parts[0])
+        return str(EXPERIMENTS["multitask"].report(config, records("multitask", 1.0)).sections[0])
 
     assert words({}).startswith("Every model was trained for 10 minutes: the one on mixed data")
     some = words({"ball": "policy", "all": "me/model"})
@@ -182,8 +184,8 @@ def test_ablations_name_the_best_choice() -> None:
         "ablate-ball-td-s1": record(0.5),
     }
     made = EXPERIMENTS["ablations"].report(config, found)
-    assert made.shows[-1] == "ball, Q R2: `td` is best with 0.5; `default` has 0.3, place 2 of 2"
-    (table,) = (part for part in made.parts if isinstance(part, Table))
+    assert made.findings[-1] == "ball, Q R2: `td` is best with 0.5; `default` has 0.3, place 2 of 2"
+    (table,) = (part for part in made.sections if isinstance(part, Table))
     rows = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
     assert rows["default"]["Q R2"] == "0.3 ± 0.1"
     assert rows["default"]["moving, 8 (x)"] == "4 ± 0"

@@ -46,19 +46,19 @@ def test_more_data_is_judged_by_reward(reward: float, words: str) -> None:
         if cell.name.startswith("play-")
     ]
     records = {half: played(0.2, 0.9), whole: played(reward, 0.7)}
-    (line,) = EXPERIMENTS["sample-efficiency"].report(CONFIG, records).shows
-    assert line.startswith("wall: 90.0% success from 100k steps, 70.0% from 200k steps: " + words)
+    (line,) = EXPERIMENTS["sample-efficiency"].report(CONFIG, records).findings
+    assert line.startswith("wall: 90.0% success from 300k steps, 70.0% from 600k steps: " + words)
     assert f"reward per step {reward - 0.2:+.5f}, 95 % " in line
     assert "success -20.0 points, " in line
 
 
 def test_parts_are_prefixes_of_one_dataset() -> None:
-    data = DataConfig(parts=(0.5, 2.0))
+    data = DataConfig(parts=(2.0, 0.5))
     config = ExperimentConfig(tasks=("ball",), data=data)
     cells = {c.name: c for c in EXPERIMENTS["sample-efficiency"].cells(config)}
-    assert cells["collect-ball-2668"].flags["episodes"] == 2668
+    assert cells["collect-ball-10800"].flags["episodes"] == 10800
     parts = [c.flags["dataset.episodes"] for c in cells.values() if c.command is TRAIN]
-    assert parts == ["0:667", "0:2668"]
+    assert parts == ["0:2700", "0:10800"]
 
 
 def test_a_given_policy_is_not_the_model_of_all_episodes() -> None:
@@ -66,4 +66,4 @@ def test_a_given_policy_is_not_the_model_of_all_episodes() -> None:
     config = ExperimentConfig(tasks=("ball", "wall"), data=DataConfig(parts=(1.0,)), train=training)
     cells = EXPERIMENTS["sample-efficiency"].cells(config)
     trained = [cell.name for cell in cells if cell.command is TRAIN]
-    assert trained == ["train-ball-first_1334-s0", "train-wall-default-s0"]
+    assert trained == ["train-ball-first_5400-s0", "train-wall-default-s0"]

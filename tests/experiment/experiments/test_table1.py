@@ -127,9 +127,11 @@ def test_the_papers_ordering_is_recognised() -> None:
         ("ours_n4", "td_mpc_td", "ball", "holds"),
         ("td_mpc_td", "ours_n4", "wall", "holds"),
     }
-    assert found.shows[0].startswith("of 9 claims, one for each task: 9 holds (")
-    assert "the most reward at N=4" in found.shows[-1]
-    assert any(line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.shows)
+    assert found.findings[0].startswith("of 9 claims, one for each task: 9 holds (")
+    assert "the most reward at N=4" in found.findings[-1]
+    assert any(
+        line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.findings
+    )
 
 
 def test_the_opposite_is_contradicted_and_equality_is_undecided() -> None:
@@ -142,12 +144,12 @@ def test_the_opposite_is_contradicted_and_equality_is_undecided() -> None:
 def test_a_claim_that_fails_in_one_training_holds_on_average_only() -> None:
     found = report(lambda task, variant, seed: (0.3, -0.1)[seed] if variant == "ours_n4" else 0.0)
     assert ("ours_n4", "ours_n1", "ball", "holds on average only") in words(found)
-    assert "in 1 of 2 trainings" in " ".join(found.shows)
+    assert "in 1 of 2 trainings" in " ".join(found.findings)
 
 
 def test_the_summary_marks_the_best_and_has_the_deviation_of_trainings() -> None:
     found = report(lambda task, variant, seed: 0.2 + 0.1 * seed if variant == "arwm" else 0.0)
-    summary = next(part for part in found.parts if isinstance(part, Table))
+    summary = next(part for part in found.sections if isinstance(part, Table))
     (arwm,) = [line for line in summary.rows if line[0] == "ARWM"]
     mean, _, spread = arwm[1].partition(" ± ")
     assert float(mean.strip("*")) == pytest.approx(0.25, abs=0.01)

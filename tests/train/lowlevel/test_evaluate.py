@@ -175,7 +175,7 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = capsys.readouterr().out
     assert "squat" in out
     assert hottest.removesuffix("_joint").removeprefix("left_").removeprefix("right_") in out
-    rows = out[out.index("skill") : out.index("figures:")].splitlines()
+    rows = out[out.index("skill") : out.index("metrics:")].splitlines()
     assert max(len(row) for row in rows) <= 120
 
 

@@ -102,11 +102,11 @@ def evaluate(config: HeldoutConfig) -> None:
     if not complete:
         counts = [f"{task} {played.get(task, 0)} of {n}" for task, n in requested.items()]
         echo(f"INCOMPLETE: {', '.join(counts)} episodes measured")
-        echo(f"figures: {output / RESULT}")
+        echo(f"metrics: {output / RESULT}")
         raise KeyboardInterrupt
     if config.pictures:
         _show(output, report, model.config.depth_max_m)
-    echo(f"figures: {output / RESULT}")
+    echo(f"metrics: {output / RESULT}")
 
 
 def _check(config: HeldoutConfig) -> Path:

@@ -128,7 +128,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
                 echo(f"INCOMPLETE: {', '.join(counts)} robots have played")
             output.mkdir(parents=True, exist_ok=True)
             write_json(output / RESULT, figures | {"_run": run})
-            echo(f"figures: {output / RESULT}")
+            echo(f"metrics: {output / RESULT}")
 
 
 def _play_all(

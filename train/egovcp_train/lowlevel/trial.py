@@ -56,7 +56,7 @@ _LAGS: Final = 25  # ticks, the longest lag looked for
 
 @dataclass(frozen=True)
 class SkillOutcome:
-    """Figures per robot, (N,); NaN where there was nothing to measure."""
+    """Metrics per robot, (N,); NaN where there was nothing to measure."""
 
     survived: NDArray[np.bool_]
     hand_error: Array  # m, mean distance to the nearest reachable target

@@ -1,4 +1,4 @@
-"""Records of a run: TensorBoard, pictures, the Rerun recording, Weights & Biases."""
+"""Loggers of a run: TensorBoard, images, the Rerun recording, Weights & Biases, Trackio."""
 
 import errno
 import sys

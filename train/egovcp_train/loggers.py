@@ -1,0 +1,174 @@
+"""Loggers of a run: scalars, images and the policy, to TensorBoard, Weights & Biases, Trackio."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import EnvironmentFailure
+
+RUN_ID: Final = "wandb/run_id.txt"
+
+
+@dataclass(frozen=True)
+class WandbConfig:
+    """Weights & Biases logging, in addition to TensorBoard."""
+
+    enable: bool = False
+    """Enable it; needs the package wandb."""
+    project: str = "egovcp"
+    """Project of the run."""
+    entity: str = ""
+    """User or team; empty: your default."""
+    notes: str = ""
+    """Description of the run."""
+    run_id: str = ""
+    """Id of the run; empty: a new one, or that of the run that is resumed."""
+    mode: Literal["online", "offline", "disabled"] = "online"
+    """offline: keep the logs below OUTPUT_DIR/wandb for `wandb sync`."""
+    disable_artifact: bool = False
+    """Do not upload the finished policy."""
+
+
+class Logger(ABC):
+    """Destination of scalars, images and the policy of a run."""
+
+    @abstractmethod
+    def log_scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Log one value per name at ``step``."""
+
+    @abstractmethod
+    def log_image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Log an image (height, width, 3) at ``step``."""
+
+    def log_policy(self, step: int, folder: Path) -> None:  # noqa: B027 - optional
+        """Upload the finished policy; by default it stays in the output folder."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write or send what remains."""
+
+
+class TensorBoardLogger(Logger):
+    """Writes below OUTPUT_DIR/tensorboard."""
+
+    def __init__(self, output: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes a second
+
+        self._writer = SummaryWriter(str(output / "tensorboard"))
+
+    def log_scalars(self, step: int, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def log_image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        self._writer.add_image(name, pixels, step, dataformats="HWC")
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _RunLogger(Logger):
+    """Logs to a run of ``package``, which has the functions of wandb."""
+
+    def __init__(self, package: Any, run: Any) -> None:
+        self._package, self._run = package, run
+
+    def log_scalars(self, step: int, values: Mapping[str, float]) -> None:
+        self._run.log(dict(values), step=step)
+
+    def log_image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        self._run.log({name: self._package.Image(pixels)}, step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class TrackioLogger(_RunLogger):
+    """Logs to a run of the local Trackio; a resumed training continues that of its folder name."""
+
+    def __init__(self, output: Path, project: str, options: Mapping[str, Any]) -> None:
+        import trackio  # an optional package
+
+        resume = "allow" if options["resume"] else "never"
+        run = trackio.init(project, output.name, config=dict(options), resume=resume)
+        super().__init__(trackio, run)
+
+
+class WandbLogger(_RunLogger):
+    """Logs to one run of Weights & Biases; a resumed training continues it."""
+
+    def __init__(self, output: Path, config: WandbConfig, options: Mapping[str, Any]) -> None:
+        """Start or continue the run.
+
+        Args:
+            output: folder of the training, which stores the id of the run.
+            config: project and user.
+            options: those of the training, to be logged.
+
+        Raises:
+            EnvironmentFailure: the user is not logged in, or the server cannot be reached.
+        """
+        import wandb  # an optional package
+
+        stored = output / RUN_ID
+        try:
+            run = wandb.init(
+                id=config.run_id or (stored.read_text("utf-8") if stored.is_file() else None),
+                project=config.project,
+                entity=config.entity or None,
+                notes=config.notes or None,
+                name=output.name,
+                dir=str(output),
+                config=dict(options),
+                job_type="train",
+                resume="allow",
+                mode=config.mode,
+            )
+        except wandb.Error as error:
+            raise EnvironmentFailure(
+                f"wandb: {' '.join(str(error).split())[:200]}; see `wandb login`, or choose "
+                "--wandb.mode=offline"
+            ) from error
+        super().__init__(wandb, run)
+        self._upload = not config.disable_artifact
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        stored.write_text(run.id, encoding="utf-8")
+
+    def log_policy(self, step: int, folder: Path) -> None:
+        if self._upload:
+            artifact = self._package.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
+            artifact.add_dir(str(folder))
+            self._run.log_artifact(artifact)
+
+
+class Loggers(Logger):
+    """All loggers of a run; false if there are none."""
+
+    def __init__(self, loggers: Sequence[Logger]) -> None:
+        self._loggers = tuple(loggers)
+
+    def __bool__(self) -> bool:
+        return bool(self._loggers)
+
+    def log_scalars(self, step: int, values: Mapping[str, float]) -> None:
+        for logger in self._loggers:
+            logger.log_scalars(step, values)
+
+    def log_image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        for logger in self._loggers:
+            logger.log_image(step, name, pixels)
+
+    def log_policy(self, step: int, folder: Path) -> None:
+        for logger in self._loggers:
+            logger.log_policy(step, folder)
+
+    def close(self) -> None:
+        for logger in self._loggers:
+            logger.close()
