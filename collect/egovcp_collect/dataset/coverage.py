@@ -23,7 +23,7 @@ class CoverageLimits:
     episodes with 800 blocks were enough to train Q."""
 
     event_episodes: int = 100  # least episodes of a task with a block, hit, pass, fall, ...
-    event_episodes_per_1000: float = 0.5  # least such episodes per 1000 steps
+    event_episodes_per_1000: float = 0.5  # least such episodes per 1000 ticks
     good_rows: float = 0.01  # least share of rows with a reward event ahead
     valid_rows: float = 0.2  # least share of rows whose return the time limit does not cut short
     return_std: float = 0.02  # least standard deviation of the return
@@ -161,8 +161,8 @@ def _checks(
     rate = 1000.0 * events / task.steps
     yield (
         events >= limits.event_episodes and rate >= limits.event_episodes_per_1000,
-        f"{events} episodes with an event, {rate:.2f} per 1000 steps",
-        f"at least {limits.event_episodes}, and {limits.event_episodes_per_1000} per 1000 steps: "
+        f"{events} episodes with an event, {rate:.2f} per 1000 ticks",
+        f"at least {limits.event_episodes}, and {limits.event_episodes_per_1000} per 1000 ticks: "
         "collect more, or shorten the episodes",
     )
     yield (

@@ -115,13 +115,13 @@ def test_all_checks_pass_with_low_limits(found: DatasetStatistics) -> None:
 def test_few_events_fail_by_default(found: DatasetStatistics) -> None:
     (text, *_) = failed(found, CoverageLimits())
     assert text.startswith("2 episodes with an event, ")
-    assert "expected at least 100, and 0.5 per 1000 steps: collect more" in text
+    assert "expected at least 100, and 0.5 per 1000 ticks: collect more" in text
     assert "may be unsuitable" in summary(assess(found))
 
 
 def test_rare_events_fail(found: DatasetStatistics) -> None:
     (text,) = failed(found, event_episodes=200, steps=10**6)
-    assert text.startswith("200 episodes with an event, 0.20 per 1000 steps; expected at least ")
+    assert text.startswith("200 episodes with an event, 0.20 per 1000 ticks; expected at least ")
 
 
 @pytest.mark.parametrize(
