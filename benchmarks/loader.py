@@ -32,11 +32,9 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from report import parser, publish
 from torch.utils.data import default_collate
-from writer import PROVENANCE, make_episode
-from writer import writer as write
+from writer import PROVENANCE, make_episode, write_dataset
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig
 from egovcp.data import (
     DatasetReader,
     DatasetWriter,
@@ -48,6 +46,7 @@ from egovcp.data import (
     StreamingSampler,
     open_dataset,
 )
+from egovcp.dataset_options import DatasetConfig
 from egovcp.hub import Content, Publication, RetryPolicy
 from egovcp.hub import publish as publish_dataset
 
@@ -187,7 +186,7 @@ def main() -> None:
         home = Path(folder)
         root = args.root or home / "dataset"
         if args.root is None:
-            write(root, [make_episode(i, 150) for i in range(args.episodes)])
+            write_dataset(root, [make_episode(i, 150) for i in range(args.episodes)])
         if args.hub_episodes:  # first: measured by wall clock, without other files in memory
             figures |= measure_hub_epoch(
                 home / "remote", args.hub_episodes, args.length, args.rounds

@@ -32,7 +32,7 @@ from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import ACTION_DIM, CONTROLLER_HZ, PLANNER_HZ, STATE_DIM, STATE_SLICES
 from egovcp_deploy.live.control import ControlLoop
-from egovcp_deploy.live.control_process import CONTROL, RECEIVING, raise_priority
+from egovcp_deploy.live.control_process import CONTROL_PRIORITY, RECEIVER_PRIORITY, raise_priority
 from egovcp_deploy.live.hardware import CameraOptions, Hardware, open_hardware
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
@@ -110,11 +110,11 @@ def control_figures(rounds: int) -> dict[str, object]:
     interval: dict[str, list[float]] = {"checked": [], "unchecked": []}
     sys.setswitchinterval(0.001)  # as the control process does
     with ExitStack() as stack:
-        with raised_priority(RECEIVING):  # for the simulated robot, too
+        with raised_priority(RECEIVER_PRIORITY):  # for the simulated robot, too
             fake = stack.enter_context(fake_g1_process("--task=ball", "--pause=1e9"))
             camera = CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
             hardware = stack.enter_context(closing(open_hardware(bridge_config(fake), camera)))
-        granted = raise_priority(CONTROL)
+        granted = raise_priority(CONTROL_PRIORITY)
         for turn in range(2 * rounds):
             checked = turn % 2 == 0
             name = "checked" if checked else "unchecked"

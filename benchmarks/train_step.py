@@ -7,7 +7,7 @@
 * ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`), in a process as Python
   starts it: the same weights, batch and random draws, and, before anything is measured, the same
   loss as ``float32``;
-* ``critic``: ``step`` with Q fitted to the critic, which is trained on, the default of
+* ``critic``: ``step`` while the critic is trained too and Q is fitted to it, the default of
   ``egovcp-train`` where the data has positions of objects; the others fit Q to returns;
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
@@ -34,8 +34,7 @@ from typing import Literal
 import torch
 from plain_step import PlainLearner
 from report import parser, publish
-from writer import make_episode
-from writer import writer as write
+from writer import make_episode, write_dataset
 
 from egovcp.data import (
     EpisodeIndex,
@@ -107,7 +106,7 @@ class Learners:
         return learner
 
     def first(self, side: Side) -> float:
-        """The first step warms all up; its loss, in float32."""
+        """Warm up every case with one step; returns its float32 loss."""
         if side == "plain":
             return self._plain.update(self._batch)
         self._ours.update(self._batch, 0.0)
@@ -132,10 +131,10 @@ class Learners:
             "critic": lambda: self._with_critic.update(self._batch, CRITIC_TRAINED),
             "data": on_data,
         }
-        return {name: timed(case) for name, case in cases.items()} | {"wait": wait}
+        return {name: timed(step) for name, step in cases.items()} | {"wait": wait}
 
 
-_learners: list[Learners] = []  # of a process of `Case`
+_learners: list[Learners] = []  # of a process of `take_turns`
 
 
 def _begin(side: Side, root: Path, returns: ReturnConfig, size: int, threads: int) -> None:
@@ -150,7 +149,7 @@ def _turn(side: Side) -> Times:
     return _learners[0].turn(side)
 
 
-def case(
+def take_turns(
     root: Path, returns: ReturnConfig, size: int, threads: int, rounds: int
 ) -> tuple[list[Times], float]:
     """Turns of both sides, each in its own process, one at a time; how far their losses differ."""
@@ -174,15 +173,15 @@ def case(
             pool.shutdown()
 
 
-def timed(case: Callable[[], object]) -> tuple[float, float]:
+def timed(step: Callable[[], object]) -> tuple[float, float]:
     """Seconds of the processor, and of the clock."""
     cpu, clock = time.process_time(), time.perf_counter()
-    case()
+    step()
     return time.process_time() - cpu, time.perf_counter() - clock
 
 
 def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
-    """What the turns of one case come to; keys begin with ``name``."""
+    """Metrics of one case; keys begin with ``name``."""
 
     def ratio(a: str, b: str, of: int = 0) -> float:
         return statistics.median(turn[a][of] / turn[b][of] for turn in turns)
@@ -213,7 +212,7 @@ def measure(
     out: dict[str, object] = {"window": LENGTH, "bf16": BF16}
     for size in batches:
         for count in threads:
-            turns, difference = case(root, returns, size, count, rounds)
+            turns, difference = take_turns(root, returns, size, count, rounds)
             name = f"step_{size}_threads_{count}"
             out |= figures(turns, name, size * LENGTH)
             out[f"{name}_loss_difference"] = difference
@@ -234,7 +233,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = args.root or Path(folder) / "dataset"
         if args.root is None:
-            write(root, [make_episode(i, 150) for i in range(100)])
+            write_dataset(root, [make_episode(i, 150) for i in range(EPISODES)])
         publish(measure(root, returns, args.batches, args.threads, args.rounds), args.json)
 
 

@@ -1,4 +1,4 @@
-"""Writing episodes: LeRobot's own writer against `DatasetWriter` and against the service's path.
+"""Writing episodes: LeRobot's own writer against `DatasetWriter` and the path of egovcp-collect.
 
 The same frames, from arrays in memory to a complete dataset on the disk:
 
@@ -66,7 +66,7 @@ def lerobot(root: Path, episodes: Sequence[Episode]) -> None:
     dataset.finalize()
 
 
-def writer(root: Path, episodes: Sequence[Episode]) -> None:
+def write_dataset(root: Path, episodes: Sequence[Episode]) -> None:
     """Whole episodes."""
     with DatasetWriter(root, PROVENANCE) as out:
         for episode in episodes:
@@ -98,9 +98,11 @@ def main() -> None:
     args = options.parse_args()
     disable_progress_bars()  # one per episode
     episodes = [make_episode(i, args.ticks) for i in range(args.episodes)]
-    for write in (writer, service):
+    for write in (lerobot, write_dataset, service):
         rate(write, episodes[:1])  # imports, first allocations
-    found = [[rate(w, episodes) for w in (lerobot, writer, service)] for _ in range(args.rounds)]
+    found = [
+        [rate(w, episodes) for w in (lerobot, write_dataset, service)] for _ in range(args.rounds)
+    ]
     figures = {}
     for i, name in enumerate(("lerobot", "writer", "service")):
         figures[f"{name}_frames_per_s"] = statistics.median(row[i] for row in found)

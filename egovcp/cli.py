@@ -15,13 +15,12 @@ import errno
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import draccus
 
-from egovcp.bounds import bounded, check_bounds, check_cores
+from egovcp.bounds import check_bounds, check_cores
 from egovcp.entry_point import INTERRUPTED, raise_on_sigint
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.files import write_text
@@ -33,36 +32,6 @@ from egovcp.values import WrongValue, build
 
 type Defaults = Callable[[Sequence[str]], Mapping[str, Any]]
 """Flags, each as ``--name=value`` -> nested default values."""
-
-
-@dataclass(frozen=True)
-class DatasetConfig:
-    """A LeRobot dataset on the Hub or on disk."""
-
-    repo_id: str = ""
-    """Dataset id, `user/name`; it is read from the Hub unless root is given."""
-    root: str = ""
-    """Folder of the dataset on disk; empty: $HF_LEROBOT_HOME/REPO_ID, or a download."""
-    revision: str = ""
-    """Branch, tag or commit SHA on the Hub; empty: main."""
-
-
-@dataclass(frozen=True)
-class SelectedDatasetConfig(DatasetConfig):
-    """Dataset and selection of episodes."""
-
-    episodes: str = ""
-    """Only these episodes: numbers, `[0, 5, 7]`, ranges as in Python, `0:1334`, or both,
-    `[0:100, 250]`; empty: all."""
-
-
-@dataclass(frozen=True)
-class WeightedDatasetConfig(SelectedDatasetConfig):
-    """One of several datasets to mix."""
-
-    weight: float | None = bounded(None, least=0)
-    """Share of the windows, relative to the other datasets; null, and then for all: in proportion
-    to the frames."""
 
 
 def parse_config[C](
@@ -82,7 +51,7 @@ def parse_config[C](
         SystemExit: after ``--help``.
     """
     try:
-        args = split_flags(argv, config_class)
+        args = split_flags(argv, config_class, prog)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
         if topics:
             echo(help_text(config_class, prog, epilog, topics[-1]))

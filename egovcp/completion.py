@@ -9,6 +9,8 @@ from importlib import import_module, metadata
 from shlex import quote
 from typing import Literal
 
+from egovcp.entry_point import EntryPoint
+
 Shell = Literal["bash", "zsh", "fish"]
 
 _BASH = """
@@ -44,7 +46,8 @@ compdef _egovcp"""
 def completion_script(shell: Shell) -> str:
     """The script; commands whose packages are missing are left out."""
     points = metadata.entry_points(group="console_scripts")
-    programs = {p.name: p.load().module for p in points if p.name.startswith("egovcp-")}
+    commands = {p.name: p.load() for p in points if p.name.startswith("egovcp-")}
+    programs = {name: c.module for name, c in commands.items() if isinstance(c, EntryPoint)}
     flags = [flag for name in sorted(programs) for flag in _flags(name, programs[name])]
     if shell == "fish":
         return "\n".join(_fish(flags))
@@ -56,7 +59,8 @@ def completion_script(shell: Shell) -> str:
         own += [f"{flag}={choice}" for choice in choices] or [f"{flag}="]
     cases = [f"    {quote(key)}) echo {quote(' '.join(own))};;" for key, own in words.items()]
     table = "\n".join(["_egovcp_words() {", 'case "$1" in', *cases, "esac", "}"])
-    return f"{table}{_BASH if shell == 'bash' else _ZSH} {' '.join({f[0]: 0 for f in flags})}"
+    names = " ".join(dict.fromkeys(name for name, *_ in flags))
+    return f"{table}{_BASH if shell == 'bash' else _ZSH} {names}"
 
 
 def _flags(name: str, module: str) -> Iterator[list[str]]:

@@ -17,7 +17,7 @@ from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
 from egovcp.files import UnsafeFileError, read_text
-from egovcp.removed_options import refuse_preset_flag, refuse_removed_flag
+from egovcp.removed_options import refuse_removed_flag
 from egovcp.values import (
     WrongValue,
     collection_or_text,
@@ -69,8 +69,9 @@ def _flags(
             yield from _flags(kind, name, limits, hides)
 
 
-def split_flags(argv: Sequence[str], config_class: type) -> list[str]:
-    """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
+def split_flags(argv: Sequence[str], config_class: type, prog: str) -> list[str]:
+    """The arguments of ``prog`` as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is
+    true.
 
     Raises:
         UsageError: a flag is unknown, removed, or without its value, or an argument is no flag.
@@ -83,10 +84,10 @@ def split_flags(argv: Sequence[str], config_class: type) -> list[str]:
         else:
             joined.append(arg)
     flags = options_of(config_class)
-    return [_checked(arg, flags) for arg in joined]
+    return [_checked(arg, flags, prog) for arg in joined]
 
 
-def _checked(arg: str, flags: Mapping[str, Any]) -> str:
+def _checked(arg: str, flags: Mapping[str, Any], prog: str) -> str:
     flag, equals, value = arg.partition("=")
     if flag in HELP:
         return arg
@@ -96,14 +97,21 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
     if not flag.startswith("-"):
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:
-        refuse_removed_flag(flag)
+        refuse_removed_flag(flag, prog)
         known = [name for name, kind in flags.items() if kind is not NOT_A_FLAG]
         raise WrongValue(f"unknown option {flag}{did_you_mean(flag, known)}")
     if flags[flag] is NOT_A_FLAG:
-        refuse_preset_flag(flag)
+        raise _not_a_flag(flag)
     if not equals and flags[flag] is not bool:
         raise WrongValue(f"option {flag} needs a value, {flag}=...")
     return arg if equals else f"{arg}=true"
+
+
+def _not_a_flag(option: str) -> UsageError:
+    return UsageError(
+        f"option {option} is not a flag: it is a constant of --preset; set it in a file, "
+        "--config_path, or in Python"
+    )
 
 
 def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
@@ -148,7 +156,7 @@ def _refuse_preset_options(flag: str, value: Any, flags: Mapping[str, Any]) -> N
     if isinstance(value, Mapping):
         for key, item in value.items():
             if flags.get(f"{flag}.{key}") is NOT_A_FLAG:
-                refuse_preset_flag(f"{flag}.{key}")
+                raise _not_a_flag(f"{flag}.{key}")
             _refuse_preset_options(f"{flag}.{key}", item, flags)
 
 

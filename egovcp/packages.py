@@ -6,7 +6,7 @@ The extras come from the metadata of the installed distributions.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from importlib import import_module, metadata
@@ -47,6 +47,11 @@ def distribution_of(module: str) -> str:
     """The distribution that contains a module: ``PIL.Image`` -> ``pillow``."""
     top = module.partition(".")[0]
     return canonicalize_name(DISTRIBUTIONS.get(top, top))
+
+
+def versions_of(distributions: Iterable[str]) -> dict[str, str]:
+    """Distribution -> installed version."""
+    return {name: metadata.version(name) for name in distributions}
 
 
 def is_installed(module: str) -> bool:

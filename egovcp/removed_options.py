@@ -33,7 +33,6 @@ RENAMED_OPTIONS: Final[Mapping[str, str]] = {
 }
 #: Option, or group of options -> one sentence.
 REMOVED_OPTIONS: Final[Mapping[str, str]] = {
-    **{old: f"its name is now {new}" for old, new in RENAMED_OPTIONS.items()},
     **dict.fromkeys(("passing", "policy.motion_ahead", "policy.paint_flight"), _TRACKER),
     **dict.fromkeys(("policy.value_of_passing", "policy.flight", "policy.loss.flight"), _TRACKER),
     **dict.fromkeys(("policy.loss.motion", "policy.loss.passing"), _TRACKER),
@@ -75,6 +74,13 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     ),
     "return_steps": "Q is compared with the returns that it was trained on: leave it out",
 }
+#: Option that only some programs had -> these programs.
+PROGRAMS: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("backend", "ray"), ("egovcp-collect", "egovcp-experiment")),
+    "format": ("egovcp-export",),
+    "realtime": ("egovcp-deploy",),
+    "return_steps": ("egovcp-eval-model",),
+}
 _INDEX: Final = re.compile(r"\[\d+\]")
 
 
@@ -82,17 +88,15 @@ class RemovedOptionError(UsageError):
     """An option of older versions."""
 
 
-def refuse_removed_flag(flag: str) -> None:
-    """Raise `RemovedOptionError` if an unknown flag, or the group that contains it, was removed."""
+def refuse_removed_flag(flag: str, prog: str = "") -> None:
+    """Raise `RemovedOptionError` if an unknown flag, or the group that contains it, was renamed, or
+    removed from ``prog``; empty: from any program."""
     parts = _INDEX.sub("", flag.removeprefix("--")).split(".")
     for end in range(1, len(parts) + 1):
-        if reason := REMOVED_OPTIONS.get(".".join(parts[:end])):
-            raise RemovedOptionError(f"option {flag} was removed: {reason}")
-
-
-def refuse_preset_flag(flag: str) -> None:
-    """Raise `RemovedOptionError` for an option that only a configuration can set."""
-    raise RemovedOptionError(
-        f"option {flag} is not a flag: it is a constant of --preset; set it in a file, "
-        "--config_path, or in Python"
-    )
+        name = ".".join(parts[:end])
+        if new := RENAMED_OPTIONS.get(name):
+            where = "; set it in a --config_path file" if new.startswith("policy.loss.") else ""
+            raise RemovedOptionError(f"option {flag} was renamed to {new}{where}")
+        programs = PROGRAMS.get(name) if prog else None
+        if name in REMOVED_OPTIONS and (not programs or prog.split()[0] in programs):
+            raise RemovedOptionError(f"option {flag} was removed: {REMOVED_OPTIONS[name]}")

@@ -76,7 +76,7 @@ class TensorFile:
             UnsafeFileError: it is missing, or not valid JSON.
         """
         if key not in self.metadata:
-            raise UnsafeFileError(f"its metadata lack {key}")
+            raise UnsafeFileError(f"its metadata has no key {key}")
         return parse_json(self.metadata[key])
 
     def require(

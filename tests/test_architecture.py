@@ -29,7 +29,14 @@ FORBIDDEN = {
     "egovcp/plan": ("egovcp.data", "egovcp.sim", "egovcp.log", "mujoco", "lerobot", "logging"),
     "egovcp/robot": ("egovcp.sim", "egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log"),
     "egovcp/sim": ("egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log", "torch"),
-    "egovcp/data": ("egovcp.sim", "egovcp.model", "egovcp.plan", "egovcp.log", "mujoco"),
+    "egovcp/data": (
+        "egovcp.sim",
+        "egovcp.model",
+        "egovcp.plan",
+        "egovcp.log",
+        "egovcp.cli",
+        "mujoco",
+    ),
     "egovcp/log": ("egovcp.data", "egovcp.sim", "egovcp.plan", "egovcp.model"),
 }
 

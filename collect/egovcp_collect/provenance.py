@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
 from collections.abc import Mapping
 from typing import Any, Final
@@ -12,6 +11,7 @@ import draccus
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
 from egovcp.flags import merged
+from egovcp.packages import versions_of
 from egovcp.sim.robot_env import controller_id_of
 from egovcp.sim.tasks.registry import ALL_TASKS, task_names
 from egovcp.values import differences
@@ -28,10 +28,7 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
         controller_id=controller_id_of(config.env, config.tasks),
         seed=config.seed,
         command=command,
-        versions={
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in _PACKAGES},
-        },
+        versions={"python": platform.python_version(), **versions_of(_PACKAGES)},
         config={
             **{name: settings[name] for name in EPISODE_OPTIONS},
             "task": ",".join(config.tasks),  # what `all` means depends on what is installed
@@ -58,20 +55,25 @@ def _migrated(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_compatible(now: Provenance, before: Provenance) -> None:
-    """Raise `UsageError` unless both collections give the same episode i, for every i."""
+    """Raise `UsageError` unless both collections have the same settings and package versions.
+
+    Differences in options of tasks that neither collects are shown only if there are no others.
+    """
     if before.seed is None:  # `egovcp-collect` always records one
         raise UsageError(
             "--resume continues a dataset that egovcp-collect began, and this one was merged or "
             "converted; collect into another --dataset.root, then join both with "
             "`egovcp-dataset merge`"
         )
-    # Older records also hold the version of LeRobot, which does not determine the data.
-    versions = {name: before.versions.get(name) for name in now.versions}
+    # Python, and LeRobot in older records, do not determine the data.
+    before_versions, now_versions = (
+        {name: p.versions.get(name) for name in _PACKAGES} for p in (before, now)
+    )
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
         **dict(differences(_migrated(before.config), _migrated(now.config), "--")),
-        **dict(differences(versions, now.versions, "version of ")),
+        **dict(differences(before_versions, now_versions, "version of ")),
     }
     changed = {
         name: f"{name} was {old}, is {new}"

@@ -73,8 +73,9 @@ class DeployConfig:
     """Only check what a run of a unitree_g1 needs, and print go or no-go per check; nothing
     moves."""
     task: str = DEFAULT_TASK
-    """Scene of the simulated robot: one of `egovcp-task list`, such as ball or sequence (several in
-    one episode, --env.sequence.parts), or package.module:Class. It is no input of the policy."""
+    """Scene of the simulated robot: a name from `egovcp-task list`, such as ball or sequence
+    (several in one episode, --env.sequence.parts), or package.module:Class. It is no input of the
+    policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
     seed: int = bounded(0, least=0, below=SEEDS)

@@ -3,7 +3,7 @@ for the best constant action."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import DataError
+from egovcp.bounds import as_flag_value
+from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError, read_json
 from egovcp.plan import PolicyStep
 from egovcp.sim.base_env import BaseVectorEnv
@@ -20,6 +21,8 @@ from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import SEARCH, Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
+from egovcp.terminal import echo
+from egovcp.values import differences
 from egovcp_deploy.options import PLANNER
 from egovcp_deploy.scores import EpisodeScore, eval_scores
 
@@ -110,11 +113,15 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
     return BestConstant(candidates[0], best.reward_per_step, rate, count)
 
 
-def load_constants(path: Path) -> dict[str, BestConstant]:
-    """Task -> result, from the ``constant.json`` of an earlier evaluation; raises `DataError` if
-    it is missing or of another format."""
+def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestConstant]:
+    """Task -> result, from the ``constant.json`` of an earlier evaluation in the same ``setting``
+    (controller and environment); one of an older version has none: a note is printed. Raises
+    `DataError` if it is missing or of another format, `UsageError` if the settings differ."""
     try:
-        return {task: _parse(task, entry) for task, entry in read_json(path).items()}
+        content = read_json(path)
+        entries = content.get("constants", content)
+        constants = {task: _parse(task, entry) for task, entry in entries.items()}
+        known = {} if entries is content else {name: content[name] for name in setting}
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"cannot read --constant.path={path}: {reason}") from error
@@ -122,6 +129,15 @@ def load_constants(path: Path) -> dict[str, BestConstant]:
         raise DataError(
             f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"
         ) from error
+    if not known:
+        echo(f"--constant.path={path} names no controller and environment: used unchecked")
+    for name, (old, new) in differences(known, setting):
+        if old is not None:  # None: an option of a later version
+            raise UsageError(
+                f"--constant.path={path} was found with {name}={as_flag_value(old)}, expected "
+                f"{as_flag_value(new)}; omit --constant.path to search the best action again"
+            )
+    return constants
 
 
 def _parse(task: str, entry: dict[str, Any]) -> BestConstant:

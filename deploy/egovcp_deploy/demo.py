@@ -14,9 +14,9 @@ from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.deploy import check_options, show_viewer
+from egovcp_deploy.deploy import check_options
 from egovcp_deploy.options import SEEDS
-from egovcp_deploy.recording import LogOptions
+from egovcp_deploy.recording import LogOptions, print_viewer_command
 from egovcp_deploy.rollouts import play_rollouts
 
 PROG: Final = "egovcp-demo"
@@ -39,7 +39,7 @@ class DemoConfig:
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
     task: str = "sequence"
-    """Scene: sequence (arch, ball and wall in turn), or another of `egovcp-task list`."""
+    """Scene: sequence (arch, ball and wall in turn), or another name from `egovcp-task list`."""
     seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenario."""
     live: str = ""
@@ -77,4 +77,4 @@ def demo(config: DemoConfig) -> None:
     for path in sorted(folder.glob("rollout-0.*")):
         path.rename(folder / f"rollout{path.suffix}")
     echo(f"video: {folder / 'rollout.gif'}")
-    show_viewer(folder / "rollout.rrd")
+    print_viewer_command(folder / "rollout.rrd")

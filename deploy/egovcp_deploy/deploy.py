@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
 from egovcp.cli import run_command
@@ -11,11 +10,11 @@ from egovcp.errors import UsageError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import load_policy
 from egovcp.sim.tasks.registry import find_task
-from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.dry_run import dry_run
 from egovcp_deploy.live.drive import drive
 from egovcp_deploy.options import PLANNER, check_output_dir
+from egovcp_deploy.recording import print_viewer_command
 from egovcp_deploy.robots.realsense_camera import require_realsense
 from egovcp_deploy.rollouts import play_rollouts, replay
 
@@ -44,26 +43,21 @@ def deploy(config: DeployConfig) -> None:
     planned = config.controller == PLANNER
     artifact = load_policy(config.policy, config.planner) if planned else None
     if config.robot.type == "sim":
-        show_viewer(play_rollouts(config, artifact) / "rollout-0.rrd")
+        print_viewer_command(play_rollouts(config, artifact) / "rollout-0.rrd")
         return
     assert artifact is not None, "checked: only the simulator runs without the planner"
     if config.robot.type == "replay":
-        show_viewer(replay(config, artifact) / "rollout-0.rrd")
+        print_viewer_command(replay(config, artifact) / "rollout-0.rrd")
     else:
         drive(config, artifact)
-
-
-def show_viewer(rrd: Path) -> None:
-    """Print the command that opens a recording; nothing if it is missing."""
-    if rrd.is_file():
-        echo(f"view it with: rerun {rrd}")
 
 
 def check_options(config: DeployConfig) -> None:
     """Raise `UsageError` or `EnvironmentFailure` for what can be known before any work starts."""
     robot = config.robot.type
     if config.controller == PLANNER:
-        config.policy.require("choose a reference that needs none, such as --controller=oracle")
+        reference = "choose a reference that needs none, such as --controller=oracle"
+        config.policy.require(reference if robot == "sim" else "")
     elif robot != "sim":
         raise UsageError(
             f"--controller={config.controller} needs --robot.type=sim; only the planner can be "

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.outputs import nearest_existing, require_writable
-from egovcp.plan import blank_observation, until
+from egovcp.plan import blank_observation, time_left_until
 from egovcp.policy_options import load_policy
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
@@ -27,6 +28,7 @@ from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.live.control_process import CONTROL_PRIORITY, NO_PRIORITY, raise_priority
 from egovcp_deploy.live.hardware import AnyCamera, open_camera
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
 from egovcp_deploy.pilot.pilot import posture
@@ -51,7 +53,7 @@ MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1
 
 def dry_run(config: DeployConfig) -> None:
     """Perform all checks of a run on a robot, also after one has failed; print each result, then
-    go. Raises the first error, if any."""
+    go. A missing real-time priority is only a warning. Raises the first error, if any."""
     errors: list[EgovcpError] = []
 
     def perform[T](
@@ -67,6 +69,9 @@ def dry_run(config: DeployConfig) -> None:
         return found
 
     robot_options, limits = config.robot, config.robot.limits
+    with ThreadPoolExecutor(1) as pool:  # only its thread gets the priority
+        granted = pool.submit(raise_priority, CONTROL_PRIORITY).result()
+    echo("go     priority: real-time" if granted else f"warn   priority: {NO_PRIORITY}")
     perform("disk", lambda: check_disk(Path(config.output_dir)))
     artifact = perform(
         "policy",
@@ -147,7 +152,7 @@ def check_plan_time(policy: RolloutPolicy) -> str:
     end = time.monotonic() + _PLANNING_S
     while len(times) < _WARM_UP + _PLANS and (time.monotonic() < end or len(times) <= _WARM_UP):
         begin = time.perf_counter()
-        step = policy.act(depth, state, until(begin + BUDGET_S))
+        step = policy.act(depth, state, time_left_until(begin + BUDGET_S))
         times.append((time.perf_counter() - begin) * 1e3)
         iterations.append(step.iterations)
     policy.reset()

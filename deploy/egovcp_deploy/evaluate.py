@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from itertools import batched
+from itertools import batched, chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -89,8 +89,8 @@ class EvalConfig:
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
     task: str = DEFAULT_TASK
-    """One of `egovcp-task list`, package.module:Class, several as ball,wall, or all; sequence plays
-    several in one episode (--env.sequence.parts)."""
+    """A name from `egovcp-task list`, package.module:Class, several as ball,wall, or all; sequence
+    plays several in one episode (--env.sequence.parts)."""
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0, below=SEEDS)
@@ -161,7 +161,10 @@ def evaluate(config: EvalConfig) -> None:
     config.check()
     config = replace(config, env=resolve_config(config.env, config.tasks))
     controller_id = controller_id_of(config.env, config.tasks)
-    constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
+    env = encoded(config.env) | {"controller": None}  # its identity is compared instead of its path
+    setting = {"low_level_controller": controller_id, "env": env}
+    path = config.constant.path
+    constants = load_constants(Path(path), setting) if path else {}
     artifact, ppo, backend = None, None, ""
     if PLANNER in config.controller_names:
         artifact = load_policy(config.policy, config.planner)
@@ -185,7 +188,7 @@ def evaluate(config: EvalConfig) -> None:
             if CONSTANT in config.controller_names:
                 constants = _find_constants(config, pool, constants)
                 found = {task: asdict(best) for task, best in constants.items()}
-                write_json(folder / "constant.json", found)
+                write_json(folder / "constant.json", {**setting, "constants": found})
             _run_episodes(config, pool, constants, scores, folder)
             if received:
                 raise KeyboardInterrupt
@@ -202,9 +205,10 @@ def evaluate(config: EvalConfig) -> None:
                 "constants": {task: asdict(best) for task, best in constants.items()},
                 "episodes": {
                     task: {
-                        name: [_score_json(score) for score in each] for name, each in row.items()
+                        name: [_score_json(score) for score in episode_scores]
+                        for name, episode_scores in by_controller.items()
                     }
-                    for task, row in played.items()
+                    for task, by_controller in played.items()
                 },
             }
             figures = summary(played, config.episodes)
@@ -213,7 +217,7 @@ def evaluate(config: EvalConfig) -> None:
             echo(table(figures))
             if backend:
                 echo(f"plans computed by {backend}")
-            every = [score for row in played.values() for each in row.values() for score in each]
+            every = chain(*(chain(*by_controller.values()) for by_controller in played.values()))
             if skipped := sum(score.skipped for score in every):
                 echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
             if missing := _missing(config, scores):
@@ -223,15 +227,15 @@ def evaluate(config: EvalConfig) -> None:
 
 def _sorted_scores(scores: Scores) -> Scores:
     """The scores in the order of the scenarios, without tasks and controllers without episodes."""
-    rows = {
+    found = {
         task: {
-            name: sorted(each, key=lambda score: score.episode)
-            for name, each in row.items()
-            if each
+            name: sorted(episode_scores, key=lambda score: score.episode)
+            for name, episode_scores in by_controller.items()
+            if episode_scores
         }
-        for task, row in scores.items()
+        for task, by_controller in scores.items()
     }
-    return {task: row for task, row in rows.items() if row}
+    return {task: by_controller for task, by_controller in found.items() if by_controller}
 
 
 def _missing(config: EvalConfig, scores: Scores) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from functools import reduce
-from importlib.metadata import version
 from operator import getitem
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +13,7 @@ import draccus
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
-from egovcp.packages import is_installed
+from egovcp.packages import is_installed, versions_of
 from egovcp.sim.scenario import HELD_OUT, SEARCH, Scenario
 
 PLANNER: Final = "planner"
@@ -80,4 +79,4 @@ def encoded(config: object, *paths: str) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Distribution -> version, of the packages that determine the results."""
-    return {name: version(name) for name in _PACKAGES}
+    return versions_of(_PACKAGES)

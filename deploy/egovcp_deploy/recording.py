@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -84,6 +85,12 @@ def recording(
     with closing(sink):
         sink.open(info)
         yield sink
+
+
+def print_viewer_command(rrd: Path) -> None:
+    """Print the command that opens a Rerun file; nothing if it is missing."""
+    if rrd.is_file():
+        echo(f"view it with: rerun {shlex.quote(str(rrd))}")
 
 
 def missing_ticks(sink: Sink) -> dict[str, int]:

@@ -160,7 +160,7 @@ def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
 
 def replay(config: DeployConfig, artifact: Artifact) -> Path:
     """Plan again on recorded observations, of at most ``episodes`` recordings. Returns the output
-    folder. Raises as `deploy`, and `DataError` if a recording is damaged."""
+    folder. Raises as `deploy`, and `DataError` for a damaged recording or another controller."""
     robot = open_recordings(Path(config.robot.recordings))
     artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, robot.count))

@@ -39,7 +39,7 @@ COMMANDS: Final = CommandGroup(
             f"{__name__}:run_new", "write a package with a task that works, and its test", ("name",)
         ),
     },
-    "TASK is a name of `egovcp-task list`, or package.module:Class.",
+    "TASK is a name from `egovcp-task list`, or package.module:Class.",
 )
 main = COMMANDS.main
 
@@ -122,8 +122,8 @@ def run_play(config: PlayTaskConfig) -> None:
     """Play, record, and name the files. Raises as `egovcp_deploy.deploy.deploy`."""
     require_packages("egovcp-deploy", "egovcp-task", *SIMULATOR_MODULES, "matplotlib")
     from egovcp_deploy.config import DeployConfig  # torch and rerun take seconds
-    from egovcp_deploy.deploy import check_options, show_viewer
-    from egovcp_deploy.recording import LogOptions
+    from egovcp_deploy.deploy import check_options
+    from egovcp_deploy.recording import LogOptions, print_viewer_command
     from egovcp_deploy.rollouts import play_rollouts
 
     name = _name(config.task)
@@ -141,7 +141,7 @@ def run_play(config: PlayTaskConfig) -> None:
     check_options(rollouts)
     folder = play_rollouts(rollouts, None)
     echo(f"video: {folder / 'rollout-0.gif'}")
-    show_viewer(folder / "rollout-0.rrd")
+    print_viewer_command(folder / "rollout-0.rrd")
 
 
 def _name(task: str) -> str:

@@ -12,7 +12,6 @@ from egovcp import spec
 from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
 from egovcp.checks.feature_statistics import numbers_in
 from egovcp.checks.lerobot_dataset import STALE, LeRobotCheck, Progress, lerobot_problems
-from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, Episode, metadata, schema, stats
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
 from egovcp.data.metadata import hash_problems
@@ -21,6 +20,7 @@ from egovcp.data.paths import files_below, require_file
 from egovcp.data.provenance import DuplicateFinder
 from egovcp.data.source import Source, locate
 from egovcp.data.staging import encode, with_index
+from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError
 
 _RELATIVE = 1e-4  # of the column's range: statistics may be float32
@@ -169,7 +169,7 @@ def _task_problems(reader: DatasetReader, rows: Sequence[EpisodeRow]) -> Iterato
     for row in rows:
         if row.tasks != [reader.task(row.index)]:
             problem = f"its tasks are {row.tasks}, expected {reader.task(row.index)}"
-            yield DataError.at(row.file, problem, row.index)
+            yield DataError.at(row.table_path, problem, row.index)
 
 
 def _episode_statistics_problems(
@@ -178,7 +178,7 @@ def _episode_statistics_problems(
     """Differences of the statistics in ``meta/episodes`` from those (R, D) of the frames."""
     for key, part in _checked(reader):
         for problem in _differences(row.stats(key), matrix[:, part], row.length):
-            yield DataError.at(row.file, f"statistics of {key}: {problem}", row.index)
+            yield DataError.at(row.table_path, f"statistics of {key}: {problem}", row.index)
 
 
 def _total_problems(

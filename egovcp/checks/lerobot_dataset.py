@@ -92,11 +92,11 @@ class LeRobotCheck:
         end = 0
         for number, row in enumerate(reader.rows):
             for problem in _row_problems(row, number, end):
-                yield DataError.at(row.file, problem, row.index)
+                yield DataError.at(row.table_path, problem, row.index)
             end = row.end
             if unknown := sorted(set(row.tasks) - names) if names else []:
                 problem = f"its task {unknown[0]!r} is not in {schema.TASKS_PATH}"
-                yield DataError.at(row.file, problem, row.index)
+                yield DataError.at(row.table_path, problem, row.index)
         if not reader.problems:
             totals = {
                 "total_episodes": (len(reader.rows), "meta/episodes lists"),
@@ -112,7 +112,7 @@ class LeRobotCheck:
 
     def file_problems(self, path: Path, progress: Progress | None = None) -> Iterator[DataError]:
         """Problems of a data file, its episodes, and their videos and statistics."""
-        listed = [row.index for row in self.by_number.values() if row.data == path]
+        listed = [row.index for row in self.by_number.values() if row.data_path == path]
         try:
             names = self.reader.open_data(path).schema_arrow.names
         except DataError as error:
@@ -274,8 +274,8 @@ class LeRobotCheck:
             yield DataError.at(path, f"{problem}, or its episode_index is repeated", number)
         self._seen.setdefault(number, path)
         if row is not None:
-            if row.data != path:
-                place = row.data.relative_to(self.reader.root)
+            if row.data_path != path:
+                place = row.data_path.relative_to(self.reader.root)
                 yield DataError.at(path, f"meta/episodes lists it in {place}", number)
             if row.length != len(table):
                 problem = f"meta/episodes gives it {row.length} frames, but it has {len(table)}"
@@ -303,7 +303,7 @@ class LeRobotCheck:
             self._sums.setdefault(key, []).append((len(table), statistics))
             if row is not None and (recorded := row.stats(key)):
                 for problem in statistics_problems(recorded, statistics, feature):
-                    yield DataError.at(row.file, f"statistics of {key}: {problem}", number)
+                    yield DataError.at(row.table_path, f"statistics of {key}: {problem}", number)
 
 
 def _row_problems(row: EpisodeRow, number: int, end: int) -> Iterator[str]:

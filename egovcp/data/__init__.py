@@ -5,7 +5,6 @@ In one line, a dataset as padded arrays [Batch, Time, Data]::
     load_arrays("data/ball")["action"]  # (B, T, 7)
 """
 
-from egovcp.cli import DatasetConfig
 from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex, describe_heldout, sample_files
 from egovcp.data.order import Mix
@@ -15,6 +14,7 @@ from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.data.samplers import InMemorySampler, SamplerConfig, ShuffleConfig, StreamingSampler
 from egovcp.data.store import Batch, EpisodeStore
 from egovcp.data.writer import DatasetWriter
+from egovcp.dataset_options import DatasetConfig
 
 __all__ = [
     "Batch",

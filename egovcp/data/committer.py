@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from egovcp import spec
-from egovcp.data import files, metadata, schema, stats
+from egovcp.data import dataset_files, metadata, schema, stats
 from egovcp.data.destination import (
     is_vacant,
     make_parent,
@@ -158,9 +158,9 @@ class Committer:
         self._staged = self.staging.numbers()
         with removed_on_error(run.with_suffix(".partial")) as partial:
             partial.unlink(missing_ok=True)
-            files.write_json(partial, asdict(self.provenance))
-            files.sync(partial)
-            files.rename(partial, run)
+            dataset_files.create_json(partial, asdict(self.provenance))
+            dataset_files.sync(partial)
+            dataset_files.rename(partial, run)
 
 
 @contextmanager

@@ -181,7 +181,7 @@ def _tables(
         DataError: one cannot be read, or is not complete.
     """
     left = dict(rows)
-    for path in dict.fromkeys(row.data for row in rows.values()):
+    for path in dict.fromkeys(row.data_path for row in rows.values()):
         for found in reader.episodes(path, columns):
             if isinstance(found, DataError):
                 raise found
@@ -195,7 +195,7 @@ def _tables(
             yield row, table
     if left:
         row = next(iter(left.values()))
-        raise DataError.at(row.data, "holds no row of it", row.index)
+        raise DataError.at(row.data_path, "has no rows of this episode", row.index)
 
 
 def _episode(
@@ -267,4 +267,4 @@ def _task(reader: LeRobotReader, table: pa.Table) -> str:
 
 
 def _placed(error: DataError, row: EpisodeRow) -> DataError:
-    return DataError.at(row.data, error.problem or str(error), row.index, error.frame)
+    return DataError.at(row.data_path, error.problem or str(error), row.index, error.frame)

@@ -2,7 +2,8 @@
 
 Held-out episodes are chosen by a hash of the episode's identity (task, seed, number). The choice
 depends on neither order nor number of episodes, so a dataset that is extended, merged or read in
-part keeps the same episodes out of training.
+part keeps the same episodes out of training, except in datasets so small that the rule selects
+none: then the episode with the lowest hash is held out, and may change when the dataset grows.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ def in_split(
     if split == "all":
         return [True] * len(identities)
     hashes = [_hash_fraction(identity) for identity in identities]
-    bound = fraction
-    if min(hashes) >= fraction > 0:
-        bound = min((value for value in hashes if value > min(hashes)), default=fraction)
+    bound, lowest = fraction, min(hashes)
+    if lowest >= fraction > 0:
+        bound = min((value for value in hashes if value > lowest), default=fraction)
     return [(value < bound) == (split == "heldout") for value in hashes]
 
 

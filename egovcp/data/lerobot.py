@@ -24,7 +24,8 @@ from egovcp.data.paths import files_below, require_file
 from egovcp.errors import DataError, SchemaError
 
 _TABLE_COLUMNS: Final = ("episode_index", "length", "dataset_from_index", "dataset_to_index")
-_DATA_PLACE: Final = ("data/chunk_index", "data/file_index")
+_DATA_LOCATION_COLUMNS: Final = ("data/chunk_index", "data/file_index")
+_VIDEO_LOCATION_COLUMNS: Final = ("chunk_index", "file_index", "from_timestamp")
 #: The problem of a parquet file without a footer, which LeRobot writes at the end.
 UNFINISHED: Final = (
     "the end of the file is missing: its recording was interrupted before LeRobot's finalize(), or "
@@ -40,10 +41,10 @@ class Feature:
     dtype: str
     shape: tuple[int, ...]
     names: tuple[str, ...]
-    """Of the values, if there is one for each."""
+    """Names of the values; empty unless each value has one."""
     is_depth: bool
     info: Mapping[str, Any] = field(default_factory=dict)
-    """Of its camera: format of the video, unit of depth."""
+    """Properties of a camera: format of the video, unit of depth."""
 
     @property
     def is_camera(self) -> bool:
@@ -59,10 +60,10 @@ class Feature:
         """Values per frame."""
         return int(np.prod(self.shape))
 
-    def label(self, value: int) -> str:
-        """Name of one of its values, ``"action[3] (gripper)"``."""
-        place = self.key if self.size == 1 else f"{self.key}[{value}]"
-        return f"{place} ({self.names[value]})" if self.names else place
+    def label(self, index: int) -> str:
+        """Name of the value at ``index``, ``"action[3] (gripper)"``."""
+        place = self.key if self.size == 1 else f"{self.key}[{index}]"
+        return f"{place} ({self.names[index]})" if self.names else place
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,13 @@ class VideoSpan:
 class EpisodeRow:
     """A row of ``meta/episodes``."""
 
-    file: Path
+    table_path: Path
     index: int
     length: int
     start: int
     """Global index of the first frame."""
     end: int
-    data: Path
+    data_path: Path
     videos: Mapping[str, VideoSpan] = field(default_factory=dict)
     columns: Mapping[str, Any] = field(default_factory=dict)
     """All columns of the row."""
@@ -156,9 +157,9 @@ class LeRobotReader:
 
     @property
     def data_files(self) -> list[Path]:
-        """The data files that are listed or present: LeRobot reads all of them."""
+        """All data files that are listed or present; LeRobot reads all of them."""
         present = [p for p in files_below(self.root / "data") if p.suffix == ".parquet"]
-        return sorted({*present, *(row.data for row in self.rows)})
+        return sorted({*present, *(row.data_path for row in self.rows)})
 
     def keys(self, dtype: str) -> list[str]:
         """The features of a dtype."""
@@ -166,7 +167,7 @@ class LeRobotReader:
 
     @property
     def numeric(self) -> list[Feature]:
-        """Features of numbers that are not part of every dataset."""
+        """Features of numbers, without those that every dataset has."""
         return [
             f for k, f in self.features.items() if f.is_numeric and k not in schema.INDEX_FEATURES
         ]
@@ -195,13 +196,20 @@ class LeRobotReader:
         yield from episode_runs(file, path, wanted)
 
     def read(self, row: EpisodeRow, keys: Sequence[str]) -> pa.Table:
-        """Some columns of the rows of an episode; raises `DataError`."""
-        for found in self.episodes(row.data, keys):
+        """Some columns of the rows of an episode.
+
+        Raises:
+            DataError: its rows are missing or damaged, or the file is.
+        """
+        file = self.open_data(row.data_path)
+        columns = [*dict.fromkeys([*keys, "episode_index"])]
+        for found in episode_runs(file, row.data_path, columns, only=row.index):
             if isinstance(found, DataError):
-                raise found
-            if found[0] == row.index:
+                if found.episode in (None, row.index):
+                    raise found
+            elif found[0] == row.index:
                 return found[1]
-        raise DataError.at(row.data, "holds no row of it", row.index)
+        raise DataError.at(row.data_path, "has no rows of this episode", row.index)
 
     def _table_rows(self, path: Path) -> Iterator[EpisodeRow]:
         require_file(self.root, path)
@@ -209,15 +217,15 @@ class LeRobotReader:
             file = open_parquet(path, own=False)
             names = file.schema_arrow.names
             videos = self.keys("video")
-            places = [f"videos/{key}/{name}" for key in videos for name in _VIDEO_PLACE]
-            for name in (*_TABLE_COLUMNS, *_DATA_PLACE, *places):
+            locations = [f"videos/{key}/{n}" for key in videos for n in _VIDEO_LOCATION_COLUMNS]
+            required = (*_TABLE_COLUMNS, *_DATA_LOCATION_COLUMNS, *locations)
+            for name in required:
                 if name not in names:
                     raise DataError.at(path, f"column {name} is missing")
             rows = file.read().to_pylist()
         for number, row in enumerate(rows):
-            empty = [name for name in (*_TABLE_COLUMNS, *_DATA_PLACE, *places) if row[name] is None]
-            if empty:
-                problem = f"column {empty[0]} is empty in row {number}"
+            if null := [name for name in required if row[name] is None]:
+                problem = f"column {null[0]} is null in row {number}"
                 self.problems.append(DataError.at(path, problem, row["episode_index"]))
                 continue
             with data_errors(path):
@@ -228,7 +236,7 @@ class LeRobotReader:
                     length,
                     start,
                     end,
-                    data=self._path(self.info["data_path"], row, "data"),
+                    data_path=self._path(self.info["data_path"], row, "data"),
                     videos={key: self._span(key, row) for key in videos},
                     columns=row,
                 )
@@ -242,12 +250,10 @@ class LeRobotReader:
         return self.root / template.format(video_key=key, **numbers)
 
 
-_VIDEO_PLACE: Final = ("chunk_index", "file_index", "from_timestamp")
-
-
 def is_own(root: Path) -> bool:
-    """Whether the dataset claims to be one of egovcp's: it has ``meta/collection.json``, or its
-    actions name the low-level controller that executed them."""
+    """Whether the dataset claims to be one of egovcp's: it has ``meta/collection.json``, its
+    actions name the low-level controller that executed them, or, if ``info.json`` cannot tell, it
+    has ``meta/sha256.json``."""
     path = root / schema.COLLECTION_PATH
     if path.exists() or path.is_symlink():
         return True
@@ -266,17 +272,23 @@ def explained(error: DataError) -> DataError:
 
 
 def episode_runs(
-    file: pq.ParquetFile, path: Path, columns: Sequence[str] | None = None
+    file: pq.ParquetFile,
+    path: Path,
+    columns: Sequence[str] | None = None,
+    only: int | None = None,
 ) -> Iterator[tuple[int, pa.Table] | DataError]:
     """(``episode_index``, rows) of the consecutive rows of each episode in a data file.
 
     Episodes may span row groups, which are read one at a time. A damaged one gives an error for
-    each of its episodes, if they can be determined.
+    each of its episodes, if they can be determined. Row groups whose statistics exclude the episode
+    ``only`` are skipped.
     """
     number, parts = -1, list[pa.Table]()
     for group in range(file.num_row_groups):
         try:
             with data_errors(path):
+                if only is not None and not _may_hold(file.metadata.row_group(group), only):
+                    continue
                 table = file.read_row_group(group, columns=columns, use_threads=False)
                 runs = list(_split_by_episode(table))
         except DataError as error:
@@ -300,7 +312,7 @@ def _split_by_episode(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
     """Consecutive rows with the same ``episode_index``."""
     column = table["episode_index"]
     if column.null_count:
-        raise DataError("column episode_index is empty in a row")
+        raise DataError.without_place("column episode_index has a null value")
     numbers = np.asarray(column.to_numpy(), np.int64)
     edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     for first, last in itertools.pairwise(edges):
@@ -312,9 +324,18 @@ def _episode_numbers(file: pq.ParquetFile, group: int) -> list[int]:
     """The episodes of a damaged row group, if that column is readable."""
     try:
         column = file.read_row_group(group, columns=["episode_index"], use_threads=False)[0]
-        return sorted(set(column.to_pylist()))
+        return sorted(set(column.drop_null().to_pylist()))
     except (pa.ArrowException, OSError):
         return []
+
+
+def _may_hold(group: pq.RowGroupMetaData, episode: int) -> bool:
+    """Whether the row group may hold rows of the episode, by its statistics."""
+    for column in map(group.column, range(group.num_columns)):
+        if column.path_in_schema == "episode_index" and column.is_stats_set:
+            found = column.statistics
+            return not found.has_min_max or found.min <= episode <= found.max
+    return True
 
 
 def _feature(key: str, found: Mapping[str, Any]) -> Feature:
@@ -335,7 +356,7 @@ def _flat_names(names: object) -> list[object]:
 
 
 def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
-    """The column of a feature that is no camera as (T, n), n values per frame.
+    """The column of a non-camera feature as (T, n), n values per frame.
 
     Raises:
         DataError: with `frame` set, a value is missing.
@@ -350,7 +371,7 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
             array = array.storage
         if array.null_count:
             at = int(np.argmax(array.is_null().to_numpy(zero_copy_only=False)))
-            raise tiff.frame_error(at // per_frame, f"{key} is empty")
+            raise tiff.frame_error(at // per_frame, f"{key} is null")
         if not _is_list(array.type):
             break
         want = feature.shape[levels] if levels < len(feature.shape) else 0

@@ -175,8 +175,8 @@ def to_numpy(column: pa.ChunkedArray, name: str, robot: RobotSpec = G1) -> NDArr
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays(array.chunks)
     if array.null_count:
-        empty = array.is_null().to_numpy(zero_copy_only=False)
-        raise tiff.frame_error(int(np.argmax(empty)), f"column {name} is empty")
+        null = array.is_null().to_numpy(zero_copy_only=False)
+        raise tiff.frame_error(int(np.argmax(null)), f"column {name} is null")
     if name == spec.DEPTH_KEY:
         return tiff.decode(array.field("bytes"), *robot.depth)
     dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name, robot)

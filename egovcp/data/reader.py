@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
 from egovcp.data.episode import Episode
 from egovcp.data.parquet import (
@@ -36,6 +35,7 @@ from egovcp.data.parquet import (
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
 from egovcp.data.source import Source, hub_cache, is_local, locate, select_episodes
+from egovcp.dataset_options import DatasetConfig, SelectedDatasetConfig
 from egovcp.errors import DataError, suggest
 from egovcp.hub import HubFileCache, RetryPolicy, is_local_path
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.bounds import as_flag_value
-from egovcp.cli import DatasetConfig
 from egovcp.data import schema
-from egovcp.data.files import write_json
+from egovcp.data.dataset_files import create_json
+from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError, suggest_path
 from egovcp.files import read_json
 from egovcp.hub import RetryPolicy, is_repo_id, snapshot
@@ -51,7 +51,8 @@ def local_root(config: DatasetConfig) -> Path:
 
 
 def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
-    """Find the dataset; download it only if no root is given and no local copy exists.
+    """Find the dataset; download it only if no root is given, and no local copy exists or a
+    revision is given.
 
     If the Hub cannot be reached, a complete earlier download is used.
 
@@ -92,7 +93,7 @@ def is_local(config: DatasetConfig) -> bool:
 def write_source(source: Source) -> None:
     """Write ``meta/source.json``, which identifies the commit of a downloaded folder."""
     content = {"repo_id": source.repo_id, "commit": source.commit}
-    write_json(source.root / schema.SOURCE_PATH, content)
+    create_json(source.root / schema.SOURCE_PATH, content)
 
 
 def read_source(root: Path, repo_id: str = "") -> Source:
@@ -143,8 +144,6 @@ def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> 
         )
     parts = [_part(part.strip(), given, count) for part in inner.split(",")]
     wanted: NDArray[np.int64] = np.unique(np.concatenate(parts))
-    if len(wanted) == 0:
-        raise UsageError(f"{given} selects no episode; there are {count}")
     return wanted
 
 
@@ -158,7 +157,12 @@ def _part(part: str, given: str, count: int) -> NDArray[np.int64]:
     number, first, end = found.groups()
     start = int(number or first or 0)
     stop = start + 1 if number else int(end or count)
-    if start < stop and stop > count:
+    if start >= stop:
+        raise UsageError(
+            f"{given}: {as_flag_value(part)} selects no episode; there are {count}, and a range "
+            "FIRST:END needs FIRST < END"
+        )
+    if stop > count:
         raise UsageError(
             f"{given} names episode {stop - 1}, but the dataset has {count} episodes, "
             f"0 to {count - 1}"

@@ -20,7 +20,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.data import files, schema, stats, tiff
+from egovcp.data import dataset_files, schema, stats, tiff
 from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.errors import DataError, EnvironmentFailure
@@ -164,13 +164,13 @@ class StagingDir:
         name = f"{staged.number:09d}-{staged.sha256}.arrow"
         partial = self.folder / f".{name}.{os.getpid()}"
         try:
-            files.write_bytes(partial, staged.payload)
-            files.sync(partial)
-            files.rename(partial, self.folder / name)
+            dataset_files.create_file(partial, staged.payload)
+            dataset_files.sync(partial)
+            dataset_files.rename(partial, self.folder / name)
         except OSError:
             partial.unlink(missing_ok=True)
             raise
-        files.sync(self.folder)
+        dataset_files.sync(self.folder)
 
     def numbers(self) -> set[int]:
         return {number for number, _ in self._files()}

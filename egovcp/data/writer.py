@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egovcp import spec
-from egovcp.data import files, schema, stats
+from egovcp.data import dataset_files, schema, stats
 from egovcp.data.destination import is_vacant, make_parent, require_new, resolve_root, writer_lock
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
@@ -61,7 +61,7 @@ class ShardWriter:
         self._robot = robot
         self._place = _place(number)
         self._data_path, self._episodes_path = shard_paths(number)
-        self._file: IO[bytes] = files.create(folder / self._data_path)
+        self._file: IO[bytes] = dataset_files.open_new(folder / self._data_path)
         # A dictionary does not compress depth; snappy halves it at little cost.
         self._writer = pq.ParquetWriter(
             self._file, schema.arrow_schema(robot), compression="snappy", use_dictionary=False
@@ -101,10 +101,10 @@ class ShardWriter:
             columns[f"meta/episodes/{name}"] = pa.array([value] * len(counts))
         for name, column in columns.items():
             table = table.append_column(name, column)
-        with files.create(self._folder / self._episodes_path) as file:
+        with dataset_files.open_new(self._folder / self._episodes_path) as file:
             pq.write_table(table, file)
         for path in (self._data_path, self._episodes_path):
-            files.sync(self._folder / path)
+            dataset_files.sync(self._folder / path)
         return stats.aggregate(self._stats, counts), sum(counts)
 
     def discard(self) -> None:
@@ -167,10 +167,10 @@ class VersionWriter:
     def _link_files(self, previous: Path) -> None:
         """Link the files of the shards, and other files beside ``data`` and ``meta``: a card."""
         for name in self._hashes:
-            files.link(previous / name, self.folder / name)
+            dataset_files.link(previous / name, self.folder / name)
         for path in previous.iterdir():
             if path.is_file():
-                files.link(path, self.folder / path.name)
+                dataset_files.link(path, self.folder / path.name)
             elif path.name not in ("data", "meta"):
                 shutil.copytree(path, self.folder / path.name)
 
@@ -223,14 +223,14 @@ class VersionWriter:
         matrices, counts = zip(*self._totals, strict=True)
         total = stats.to_json(stats.aggregate(matrices, counts), self.frames, self._robot or G1)
         self._write_tasks()
-        files.write_json(self.folder / schema.INFO_PATH, self._info())
-        files.write_json(self.folder / schema.STATS_PATH, total)
-        files.write_bytes(self.folder / schema.COLLECTION_PATH, self._collection())
+        dataset_files.create_json(self.folder / schema.INFO_PATH, self._info())
+        dataset_files.create_json(self.folder / schema.STATS_PATH, total)
+        dataset_files.create_file(self.folder / schema.COLLECTION_PATH, self._collection())
         meta = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.COLLECTION_PATH)
         hashes = self._hashes | {path: sha256(self.folder / path) for path in meta}
-        files.write_json(self.folder / schema.HASHES_PATH, hashes)
+        dataset_files.create_json(self.folder / schema.HASHES_PATH, hashes)
         for path in (*(self.folder / "meta").glob("*.*"), *self.folder.rglob("*/"), self.folder):
-            files.sync(path)
+            dataset_files.sync(path)
         return self._complete
 
     def discard(self) -> None:
@@ -243,7 +243,7 @@ class VersionWriter:
 
         names = pd.Index(list(self._tasks), name="task")
         frame = pd.DataFrame({"task_index": list(self._tasks.values())}, index=names)
-        with files.create(self.folder / schema.TASKS_PATH) as file:
+        with dataset_files.open_new(self.folder / schema.TASKS_PATH) as file:
             frame.to_parquet(file)
 
     def _info(self) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def publish_version(folder: Path, root: Path, replace: bool = False) -> None:
         if replace:
             _exchange(folder, root)
         else:
-            files.rename(folder, root)  # replaces an empty folder only
+            dataset_files.rename(folder, root)  # replaces an empty folder only
     except OSError as error:
         if error.errno in _OCCUPIED:
             raise UsageError(
@@ -300,7 +300,7 @@ def publish_version(folder: Path, root: Path, replace: bool = False) -> None:
                 "container image; copy it to a folder inside a volume and use that"
             ) from error
         raise
-    files.sync(root.parent)
+    dataset_files.sync(root.parent)
 
 
 @contextmanager
@@ -313,7 +313,7 @@ def new_dataset(root: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)  # of a killed command
         try:
             yield folder
-            files.sync_tree(folder)
+            dataset_files.sync_tree(folder)
             publish_version(folder, root)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -321,14 +321,14 @@ def new_dataset(root: Path) -> Iterator[Path]:
 
 def _exchange(folder: Path, root: Path) -> None:
     try:
-        files.exchange(folder, root)
+        dataset_files.exchange(folder, root)
     except OSError as error:
         if error.errno not in _NO_EXCHANGE:
             raise
         aside = _aside(folder)  # `recover` completes the three renames after a crash
-        files.rename(root, aside)
-        files.rename(folder, root)
-        files.rename(aside, folder)
+        dataset_files.rename(root, aside)
+        dataset_files.rename(folder, root)
+        dataset_files.rename(aside, folder)
 
 
 def recover(folder: Path, root: Path) -> None:
@@ -336,7 +336,7 @@ def recover(folder: Path, root: Path) -> None:
     aside = _aside(folder)
     if aside.exists():
         if is_vacant(root):
-            files.rename(aside, root)
+            dataset_files.rename(aside, root)
         else:
             shutil.rmtree(aside)
 

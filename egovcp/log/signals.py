@@ -61,17 +61,15 @@ def _actions() -> Iterator[Signal]:
 def _states() -> Iterator[Signal]:
     for group, part in STATE_SLICES.items():
         if not group.startswith("joint_"):
-            yield _state(group, group, range(part.start, part.stop))
+            yield _state(group, range(part.start, part.stop))
     for group in ("joint_position", "joint_velocity"):
         first = STATE_SLICES[group].start
         for name, joints in _JOINTS_OF.items():
-            yield _state(f"{group}/{name}", "", [first + i for i in joints])
+            yield _state(f"{group}/{name}", [first + i for i in joints])
 
 
-def _state(path: str, prefix: str, indices: Sequence[int]) -> Signal:
-    names = tuple(
-        STATE_NAMES[i].removeprefix(f"{prefix}.").removeprefix("command.") for i in indices
-    )
+def _state(path: str, indices: Sequence[int]) -> Signal:
+    names = tuple(STATE_NAMES[i].removeprefix(f"{path}.").removeprefix("command.") for i in indices)
     return Signal(f"{paths.STATE}/{path}", names, lambda tick: tick.state[list(indices)])
 
 
@@ -87,7 +85,7 @@ SIGNALS: Final = (*_actions(), *_states(), *_outcomes())
 
 
 def signals_of(robot: RobotSpec) -> tuple[Signal, ...]:
-    """The signals of a robot: of another one than the G1 its actions and groups of states."""
+    """The signals of a robot; for other robots than the G1: actions and each group of states."""
     if robot.is_g1:
         return SIGNALS
     action = Signal(f"{paths.ACTION}/normalised", robot.action_names, lambda tick: tick.action_sent)

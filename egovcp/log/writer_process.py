@@ -33,7 +33,9 @@ def serve(commands: Connection, reports: Connection) -> None:
         sink, info = first
         sink.open(info)
         _report(reports, 0)
-        for count, tick in enumerate(iter(lambda: next(messages, None), None), start=1):
+        for count, tick in enumerate(messages, start=1):
+            if tick is None:
+                break
             sink.write(tick)
             _report(reports, count)
         sink.close()
@@ -62,7 +64,7 @@ def _picklable(error: Exception) -> Exception:
 
 
 def main() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and closes the log
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the log ends with its pipe
     with suppress(OSError):
         os.nice(NICENESS)
     commands, reports = map(int, sys.argv[1:])

@@ -4,7 +4,7 @@ from egovcp.plan.config import PlannerConfig, require_affordable, require_compat
 from egovcp.plan.objective import PlanEvaluator, ReferenceEvaluator
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.policy import Policy, PolicyStep, blank_observation
-from egovcp.plan.search import Optimiser, Plan, make_plan, until
+from egovcp.plan.search import Optimiser, Plan, make_plan, time_left_until
 from egovcp.plan.value_map import HandGrid, hand_grid, value_map
 
 __all__ = [
@@ -22,6 +22,6 @@ __all__ = [
     "optimiser_of",
     "require_affordable",
     "require_compatible",
-    "until",
+    "time_left_until",
     "value_map",
 ]

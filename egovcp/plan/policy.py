@@ -155,8 +155,8 @@ class Policy:
         Args:
             depth: as in `observe`.
             state: as in `observe`.
-            remaining: seconds until the result is due (`egovcp.plan.until`); the planner does as
-                many iterations as fit, at least one. None: all of them.
+            remaining: seconds until the result is due (`egovcp.plan.time_left_until`); the planner
+                does as many iterations as fit, at least one. None: all of them.
         """
         self.observe(depth, state)
         evaluator = self.prepare()

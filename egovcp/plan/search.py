@@ -40,20 +40,20 @@ def target_deltas(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
     already of this kind are returned unchanged.
     """
     target = reflect_once((start + eta * deltas.sum(-2)).clamp(-3.0, 3.0))
-    far = ((target - start) / eta)[..., None, :]
-    steps = torch.arange(deltas.shape[-2], dtype=far.dtype, device=far.device)[:, None]
-    return (far.abs() - steps).clamp(0.0, 1.0) * far.sign()
+    steps_to_target = ((target - start) / eta)[..., None, :]
+    steps = torch.arange(deltas.shape[-2], dtype=deltas.dtype, device=deltas.device)[:, None]
+    return (steps_to_target.abs() - steps).clamp(0.0, 1.0) * steps_to_target.sign()
 
 
 def shift(deltas: Tensor) -> Tensor:
-    """Drop the executed first one of deltas (E, N, 7) and append a zero: the warm start."""
+    """The warm start: deltas (E, N, 7) without the first, which was executed, and a zero step."""
     return torch.cat([deltas[:, 1:], torch.zeros_like(deltas[:, :1])], 1)
 
 
 class SearchState(NamedTuple):
     """State of a search for E robots."""
 
-    mean: Tensor  # (E, N, 7) deltas of the present result
+    mean: Tensor  # (E, N, 7) deltas of the current result
     std: Tensor  # (E, N, 7)
     elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last iteration
     values: Tensor  # (E, elites); -inf where J was not finite
@@ -92,8 +92,8 @@ class Plan(NamedTuple):
     iterations: int
 
 
-def until(deadline_s: float) -> Callable[[], float]:
-    """Seconds left until ``deadline_s`` of `time.perf_counter`."""
+def time_left_until(deadline_s: float) -> Callable[[], float]:
+    """Returns a function: seconds left until ``deadline_s`` of `time.perf_counter`."""
     return lambda: deadline_s - time.perf_counter()
 
 
@@ -119,7 +119,8 @@ def make_plan[C](
         remaining: seconds until the result is due. The search stops if another iteration, as long
             as the slowest so far, would end later, but does at least one.
     """
-    left, slowest = remaining() if remaining else 0.0, 0.0
+    left = remaining() if remaining else 0.0
+    slowest = 0.0
     state = _start(executed, config, warm)
     plan_value = evaluator.at(carry)
     walk = optimiser.random_walk if isinstance(optimiser, FastRandomWalk) else random_walk
@@ -143,8 +144,8 @@ def make_plan[C](
 
 
 def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tensor:
-    """Discounted costs (E, M) of poses and action changes in plans (E, M, A, 7) from a_{t-1}
-    (E, 1, 7):
+    """Discounted costs (E, M) of poses and action changes in plans (E, M, config.actions, 7), of
+    which the first N count, from a_{t-1} (E, 1, 7):
 
     sum_{k<K} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
 

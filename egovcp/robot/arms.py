@@ -17,10 +17,10 @@ from egovcp.robot.kinematics import (
     COS_ROTATION,
     JOINT_AXIS,
     JOINT_LOWER,
+    JOINT_OFFSET,
     JOINT_UPPER,
     LINK_COM,
     LINK_MASS,
-    LINK_OFFSET,
     PALM_OFFSET,
     REST_ROTATION,
     SIN_ROTATION,
@@ -29,7 +29,7 @@ from egovcp.spec import CONTROLLER_HZ
 
 _SHAPE: Final = (2, 7)
 _FIRST_LINK: Final = ARMS.start + 1
-_OFFSET: Final = LINK_OFFSET[ARMS].reshape(*_SHAPE, 3)
+_OFFSET: Final = JOINT_OFFSET[ARMS].reshape(*_SHAPE, 3)
 MASS: Final = LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
 _COM: Final = LINK_COM[_FIRST_LINK:].reshape(*_SHAPE, 3)
 _AXIS: Final = np.argmax(np.abs(JOINT_AXIS[ARMS]), axis=-1)  # (14,) 0, 1 or 2
@@ -186,7 +186,7 @@ DT: Final = 1.0 / CONTROLLER_HZ
 _SERVO_KP: Final = STIFFNESS[ARMS].reshape(2, 7)
 _SERVO_KD: Final = DAMPING[ARMS].reshape(2, 7)
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])
-TORSO_ORIGIN: Final = LINK_OFFSET[13]  # (3,) m, pelvis frame: roll and pitch axes of the waist
+TORSO_ORIGIN: Final = JOINT_OFFSET[13]  # (3,) m, pelvis frame: roll and pitch axes of the waist
 _REST_COM: Final = link_coms(forward(REST[None]))
 _REST_MOMENT: Final = first_moment(_REST_COM)[0, :, 0].sum(axis=0)  # (3,) kg m
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -46,7 +46,7 @@ def model_path() -> Path:
 
 @dataclass(frozen=True)
 class Motor:
-    """One motor type: rotor inertias (kg m^2) of its two planetary stages, and limits."""
+    """One motor type: rotor inertia and those of the two gear stages' carriers (kg m^2), limits."""
 
     rotor_inertia: tuple[float, float, float]
     gear: tuple[float, float]
@@ -66,9 +66,9 @@ M7520_14: Final = Motor((0.489e-4, 0.098e-4, 0.533e-4), (4.5, 1 + 48 / 22), 88.0
 M7520_22: Final = Motor((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0), 139.0, 20.0)
 M4010: Final = Motor((0.068e-4, 0.0, 0.0), (5.0, 5.0), 5.0, 22.0)
 
-#: Joint name ending -> motor type, number of motors, gains (kp N m/rad, kd N m s/rad) or None for
-#: the published ones, with which hands lag 6-8 cm behind the random walk. Ankles and the roll and
-#: pitch of the waist are four-bar linkages with two motors, taken as 1:1.
+#: Joint name without side and `_joint` -> motor type, number of motors, gains (kp N m/rad, kd N m
+#: s/rad) or None for the published ones, with which hands lag 6-8 cm behind the random walk. Ankles
+#: and the roll and pitch of the waist are four-bar linkages with two motors, taken as 1:1.
 _ACTUATORS: Final[dict[str, tuple[Motor, int, tuple[float, float] | None]]] = {
     "hip_pitch": (M7520_14, 1, None),
     "hip_roll": (M7520_22, 1, None),
@@ -97,34 +97,30 @@ def joint_kind(joint: str) -> str:
     return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
 
 
-def _per_joint(value: Callable[[Motor, int], float], gain: int | None = None) -> Array:
-    """(J,) of each joint's motor and their number, or the gain that replaces it."""
-    out = []
-    for name in JOINT_NAMES:
-        motor, count, gains = _ACTUATORS[joint_kind(name)]
-        out.append(value(motor, count) if gains is None or gain is None else gains[gain])
-    array = np.array(out)
+def _read_only(values: Iterable[float]) -> Array:
+    array = np.array(list(values))
     array.setflags(write=False)
     return array
 
 
-def _stiffness(motor: Motor, count: int) -> float:
-    return motor.armature * count * _NATURAL_FREQUENCY**2
+def _gains(published: Array, number: int) -> Array:
+    """(J,) gain ``number`` of each joint in `_ACTUATORS`, or the published one."""
+    pairs = zip(_JOINTS, published, strict=True)
+    return _read_only(gain if own is None else own[number] for (_, _, own), gain in pairs)
 
 
-def _damping(motor: Motor, count: int) -> float:
-    return 2.0 * _DAMPING_RATIO * (motor.armature * count) * _NATURAL_FREQUENCY
-
-
-ARMATURE: Final = _per_joint(lambda motor, count: motor.armature * count)  # kg m^2
-EFFORT_LIMIT: Final = _per_joint(lambda motor, count: motor.effort_limit * count)  # N m
-VELOCITY_LIMIT: Final = _per_joint(lambda motor, _: motor.velocity_limit)  # rad/s
+_JOINTS: Final = [_ACTUATORS[joint_kind(name)] for name in JOINT_NAMES]
+ARMATURE: Final = _read_only(motor.armature * count for motor, count, _ in _JOINTS)  # kg m^2
+EFFORT_LIMIT: Final = _read_only(motor.effort_limit * count for motor, count, _ in _JOINTS)  # N m
+VELOCITY_LIMIT: Final = _read_only(motor.velocity_limit for motor, *_ in _JOINTS)  # rad/s
 #: Published servo gains: 10 Hz natural frequency on the armature, damping ratio 2.
-PUBLISHED_STIFFNESS: Final = _per_joint(_stiffness)  # N m/rad
-PUBLISHED_DAMPING: Final = _per_joint(_damping)  # N m s/rad
+PUBLISHED_STIFFNESS: Final = _read_only(ARMATURE * _NATURAL_FREQUENCY**2)  # N m/rad
+PUBLISHED_DAMPING: Final = _read_only(
+    2.0 * _DAMPING_RATIO * ARMATURE * _NATURAL_FREQUENCY
+)  # N m s/rad
 #: The gains in use: published ones in legs and waist, stiffer arms.
-STIFFNESS: Final = _per_joint(_stiffness, 0)  # N m/rad
-DAMPING: Final = _per_joint(_damping, 1)  # N m s/rad
+STIFFNESS: Final = _gains(PUBLISHED_STIFFNESS, 0)  # N m/rad
+DAMPING: Final = _gains(PUBLISHED_DAMPING, 1)  # N m s/rad
 
 WAIST: Final = slice(12, 15)
 ARMS: Final = slice(15, 29)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from egovcp.robot.arms import DT
 from egovcp.robot.g1 import STIFFNESS
 from egovcp.robot.geometry import Array, heading_rotation, rotate
-from egovcp.robot.kinematics import FOOT_SPACING, SOLE_HEIGHT, foot_positions
+from egovcp.robot.kinematics import ANKLE_HEIGHT, HALF_STANCE_WIDTH, foot_positions
 from egovcp.robot.stance_table import NU, StanceRow
 from egovcp.spec import STATE_SLICES
 
@@ -189,7 +189,7 @@ def _leaves_support(
 
 def _omega(height: Array) -> Array:
     """(B,) 1/s, of the inverted pendulum."""
-    return np.asarray(np.sqrt(_GRAVITY / np.maximum(height - SOLE_HEIGHT, 0.3)))
+    return np.asarray(np.sqrt(_GRAVITY / np.maximum(height - ANKLE_HEIGHT, 0.3)))
 
 
 def _tick(
@@ -320,7 +320,7 @@ def _swing(
     goal = foothold(m, row, height, command, config)
     done = progress**2 * (3.0 - 2.0 * progress) * leaves
     along = done * (goal[:, :1] + row.pelvis[:, :1]) / length
-    across = done * (goal[:, 1:] - _SIDE * FOOT_SPACING) / length
+    across = done * (goal[:, 1:] - _SIDE * HALF_STANCE_WIDTH) / length
     out = np.zeros_like(pose)
     out[..., _HIP_PITCH] = -bend / 2 - along - tilt[:, 1:]
     out[..., _KNEE] = bend
@@ -345,11 +345,11 @@ def _stance(
     length = _leg_length(pose)
     ahead = 2 * DT * m.velocity  # targets act about two ticks after what was measured
     along = (m.feet[..., 0] + row.pelvis[:, :1] - ahead[:, :1]) / length
-    across = (m.feet[..., 1] - _SIDE * FOOT_SPACING - ahead[:, 1:]) / length
+    across = (m.feet[..., 1] - _SIDE * HALF_STANCE_WIDTH - ahead[:, 1:]) / length
     over = -m.feet[..., 0] - row.pelvis[:, :1]  # m, the pelvis ahead of either foot
     fast = m.velocity - command[:, :2]
     roll, pitch = tilt.T
-    bend = config.knee * (-m.feet[..., 2] - (height[:, None] - SOLE_HEIGHT))
+    bend = config.knee * (-m.feet[..., 2] - (height[:, None] - ANKLE_HEIGHT))
     hip, tip, ankle, edge = (
         config.hip_pitch,
         config.hip_roll,

@@ -36,12 +36,12 @@ JOINT_AXIS: Final[Array] = np.array(_TABLE["axis"])  # (J, 3) child link frame
 JOINT_LOWER: Final[Array] = np.array(_TABLE["lower"])  # (J,) rad
 JOINT_UPPER: Final[Array] = np.array(_TABLE["upper"])  # (J,) rad
 PALM_OFFSET: Final[Array] = np.array(_TABLE["palm"])  # (2, 3) m, wrist yaw link frame, left, right
-LINK_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the parent's frame
+JOINT_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the parent's frame
 
-SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
-FOOT_SPACING: Final = 0.1185  # m, from the ankles to the midline in the standing pose
-_LEGS: Final = 12  # the first joints; each leg is a chain of six from the pelvis
-TORSO: Final = LINK_NAMES.index("torso_link")
+ANKLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
+HALF_STANCE_WIDTH: Final = 0.1185  # m, from the ankles to the midline in the standing pose
+_NUM_LEG_JOINTS: Final = 12  # the first joints; each leg is a chain of six from the pelvis
+TORSO_LINK: Final = LINK_NAMES.index("torso_link")
 _WRISTS: Final = tuple(LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right"))
 
 
@@ -137,18 +137,16 @@ def link_transforms(joint_position: Array) -> tuple[Array, Array]:
     rotation[:, 0] = np.eye(3)
     for links, parents in _levels():
         base = rotation[:, parents]
-        position[:, links] = position[:, parents] + rotate(base, LINK_OFFSET[links - 1])
+        position[:, links] = position[:, parents] + rotate(base, JOINT_OFFSET[links - 1])
         rotation[:, links] = base @ local[:, links - 1]
     return position, rotation
 
 
 def foot_positions(joint_position: Array) -> Array:
     """(B, 2, 3) m, left and right ankle-roll link in the pelvis frame, of (B, J) rad."""
-    n = len(joint_position)
-    local = joint_rotations(joint_position[:, :_LEGS], slice(0, _LEGS)).reshape(
-        n, 2, _LEGS // 2, 3, 3
-    )
-    offset = LINK_OFFSET[:_LEGS].reshape(2, -1, 3)
+    n, legs = len(joint_position), slice(0, _NUM_LEG_JOINTS)
+    local = joint_rotations(joint_position[:, legs], legs).reshape(n, 2, -1, 3, 3)
+    offset = JOINT_OFFSET[legs].reshape(2, -1, 3)
     rotation, position = local[:, :, 0], np.tile(offset[:, 0], (n, 1, 1))
     for k in range(1, local.shape[2]):
         position = position + rotate(rotation, offset[:, k])

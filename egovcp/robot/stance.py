@@ -22,7 +22,7 @@ from egovcp.robot.arms import IDENTITY as ARM_IDENTITY
 from egovcp.robot.g1 import ARMS, DAMPING, EFFORT_LIMIT, STIFFNESS
 from egovcp.robot.geometry import Array, heading_rotation, rotate
 from egovcp.robot.kinematics import (
-    SOLE_HEIGHT,
+    ANKLE_HEIGHT,
     TARGET_HIGH,
     TARGET_LOW,
     foot_positions,
@@ -310,4 +310,4 @@ def pelvis_height(joint_position: Array, gravity: Array) -> Array:
     """(B,) pelvis above the lower foot's sole, m."""
     ankles = foot_positions(np.asarray(joint_position, dtype=np.float64))
     feet = rotate(heading_rotation(gravity)[:, None], ankles)
-    return np.asarray(SOLE_HEIGHT - np.min(feet[..., 2], axis=1))
+    return np.asarray(ANKLE_HEIGHT - np.min(feet[..., 2], axis=1))

@@ -21,7 +21,7 @@ import numpy as np
 from egovcp.robot.arms import REST
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.geometry import Array
-from egovcp.robot.kinematics import FOOT_SPACING, SOLE_HEIGHT
+from egovcp.robot.kinematics import ANKLE_HEIGHT, HALF_STANCE_WIDTH
 from egovcp.robot.stance_table import NF, NR, NU, NX, NY, NZ
 from egovcp.spec import CONTROLLER_HZ, NUM_JOINTS
 
@@ -80,7 +80,7 @@ class StanceModel:
         self.model = model
         self.data = mujoco.MjData(model)
         self.feet = [model.body(f"{s}_ankle_roll_link").id for s in ("left", "right")]
-        self.target = np.array([[0.0, s * FOOT_SPACING, SOLE_HEIGHT] for s in (1, -1)])
+        self.target = np.array([[0.0, s * HALF_STANCE_WIDTH, ANKLE_HEIGHT] for s in (1, -1)])
 
     def place(self, qpos: Array) -> None:
         """Set the configuration and compute positions, inertia and bias forces."""

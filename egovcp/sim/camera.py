@@ -23,8 +23,8 @@ from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 Array = NDArray[np.float64]
 
-_GROUPS: Final = np.array([1, 0, 0, 1, 0, 0], dtype=np.uint8)
-_UPRIGHT: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_VISIBLE_GROUPS: Final = np.array([1, 0, 0, 1, 0, 0], dtype=np.uint8)
+_IDENTITY_QUAT: Final = np.array([1.0, 0.0, 0.0, 0.0])
 _SLACK: Final = 1e-3  # pixels and metres; rounding is a billionth of it
 _CORNERS: Final = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
@@ -39,7 +39,7 @@ class RayCaster:
 
     def __init__(self, model: mujoco.MjModel, body: int) -> None:
         self.model, self.body = model, body
-        seen = _GROUPS.astype(np.bool_)[model.geom_group] & (model.geom_bodyid != body)
+        seen = _VISIBLE_GROUPS.astype(np.bool_)[model.geom_group] & (model.geom_bodyid != body)
         plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self.floor = _level_floor(model, np.flatnonzero(seen & plane))
         self.solid = np.flatnonzero(seen & ~plane)  # (G,) ids of the geoms besides the floor
@@ -54,7 +54,7 @@ class RayCaster:
         # fresh for each call, because threads share the camera
         geom, out = np.empty(count, dtype=np.int32), np.empty(count)
         mujoco.mj_multiRay(
-            self.model, data, origin, rays.ravel(), _GROUPS, True, self.body,
+            self.model, data, origin, rays.ravel(), _VISIBLE_GROUPS, True, self.body,
             geom, out, None, count, cutoff,
         )  # fmt: skip
         return out
@@ -66,7 +66,7 @@ def _level_floor(model: mujoco.MjModel, planes: NDArray[np.intp]) -> float | Non
         return -np.inf
     floor = planes[0]
     simple = len(planes) == 1 and model.geom_bodyid[floor] == 0
-    level = (model.geom_quat[floor] == _UPRIGHT).all()
+    level = (model.geom_quat[floor] == _IDENTITY_QUAT).all()
     if not simple or not level or (model.geom_size[floor, :2] > 0).any():
         return None
     return float(model.geom_pos[floor, 2])

@@ -1,6 +1,6 @@
 """Policies that need no learning: constant actions, random walks, and scripted oracles.
 
-A policy returns normalised actions (B, 7). The environment applies the same delays and rate limits
+A policy returns normalised actions (B, A). The environment applies the same delays and rate limits
 to all of them; only oracles read the simulator's privileged state.
 """
 
@@ -28,12 +28,12 @@ class EnvPolicy(ABC):
     def reset(  # noqa: B027 - optional
         self, env: BaseVectorEnv, scenarios: Sequence[Scenario]
     ) -> None:
-        """Each row starts one of ``scenarios``."""
+        """Start one of ``scenarios`` in each row."""
 
     def reset_rows(  # noqa: B027 - optional
         self, rows: Sequence[int], scenarios: Sequence[Scenario]
     ) -> None:
-        """``rows`` start ``scenarios``."""
+        """Start an episode in each of ``rows``."""
 
     @abstractmethod
     def act(self, env: BaseVectorEnv) -> Array:
@@ -41,7 +41,7 @@ class EnvPolicy(ABC):
 
 
 class Constant(EnvPolicy):
-    """The same action always."""
+    """Always the same action."""
 
     def __init__(self, action: Sequence[float] | NDArray[np.floating]) -> None:
         self._action = np.asarray(action, dtype=np.float64)
@@ -58,7 +58,7 @@ class Hold(EnvPolicy):
 
 
 class RandomWalk(EnvPolicy):
-    """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^7.
+    """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^A.
 
     The defaults are the paper's (section III-B).
 
@@ -97,7 +97,7 @@ class RandomWalk(EnvPolicy):
             self._rngs[row] = scenario.rng("policy")
 
     def start_at(self, action: Array, rngs: Sequence[np.random.Generator]) -> None:
-        """Start each row at ``action`` (B, 7), at a random time between two of its steps.
+        """Start each row at ``action`` (B, A), at a random time between two of its steps.
 
         The row's further steps are sampled from its generator in ``rngs``.
         """

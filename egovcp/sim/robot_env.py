@@ -1,4 +1,4 @@
-"""The environment of robots of another kind than the G1, and the choice of the environment."""
+"""Environment of robots other than the G1, and `make_env`, which chooses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import SimulationDiverged
+from egovcp.errors import SimulationDiverged, UsageError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.base_env import BaseInstance, BaseVectorEnv, Observation, StepResult, one_robot
 from egovcp.sim.env import VectorEnv
@@ -49,9 +49,13 @@ def controller_id_of(config: EnvConfig, tasks: Iterable[str]) -> str:
 
 
 def robot_class(task: str) -> type[MujocoRobot]:
-    """The robot of a `RobotTask`."""
+    """The robot of a `RobotTask`; raises `UsageError` if ``task`` is of another class."""
     kind = find_task(task)
-    assert issubclass(kind, RobotTask), f"{task} is a task of the G1"
+    if not issubclass(kind, RobotTask):
+        raise UsageError(
+            f"task {task}: {kind.__name__} is of robot {kind.robot_spec().robot_type}, but not a "
+            "subclass of egovcp.sim.tasks.RobotTask; make it one"
+        )
     return kind.robot_class
 
 

@@ -18,11 +18,11 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egovcp.entry_point import INTERRUPTED
+from egovcp.packages import versions_of
 
 if TYPE_CHECKING:  # not imported in the processes of cells
     from egovcp_experiment.cell import Cell
@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # not imported in the processes of cells
 
 def versions() -> dict[str, str]:
     """Versions of the packages that metrics depend on."""
-    return {name: version(name) for name in ("egovcp", "torch", "numpy", "mujoco")}
+    return versions_of(("egovcp", "torch", "numpy", "mujoco"))
 
 
 @cache

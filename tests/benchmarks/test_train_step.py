@@ -7,7 +7,7 @@ import pytest
 import torch
 import train_step
 from plain_step import PlainModel, plain_loss
-from writer import make_episode, writer
+from writer import make_episode, write_dataset
 
 from egovcp.model import WorldModel, WorldModelConfig, world_model_loss
 from egovcp.testing import random_batch
@@ -29,7 +29,7 @@ def test_the_plain_step_has_the_same_loss(seed: int) -> None:
 @pytest.mark.slow
 def test_a_given_dataset_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root, out = tmp_path / "dataset", tmp_path / "figures.json"
-    writer(root, [make_episode(i, 40) for i in range(3)])
+    write_dataset(root, [make_episode(i, 40) for i in range(3)])
     flags = f"--root {root} --json {out} --batches 2 --threads 1 --rounds 1"
     monkeypatch.setattr("sys.argv", ["train_step.py", *flags.split()])
     train_step.main()

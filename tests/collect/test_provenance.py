@@ -31,6 +31,13 @@ def test_a_missing_option_counts_as_its_default() -> None:
         require_compatible(replace(now, config=other), replace(now, config=older))
 
 
+def test_versions_of_packages_are_compared_but_not_that_of_python() -> None:
+    now = replace(provenance(), versions={"python": "3.12.9", "mujoco": "3.4"})
+    require_compatible(now, replace(now, versions={"python": "3.12.3", "mujoco": "3.4"}))
+    with pytest.raises(UsageError, match=r"version of mujoco was 3\.3, is 3\.4"):
+        require_compatible(now, replace(now, versions={"python": "3.12.9", "mujoco": "3.3"}))
+
+
 def test_controllers_are_compared_by_id() -> None:
     before, now = provenance(), copy.deepcopy(provenance())
     now.config["env"]["controller"] = "/elsewhere/walk.safetensors"

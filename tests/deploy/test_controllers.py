@@ -82,7 +82,7 @@ def test_constant_json_is_read_back(tmp_path: Path) -> None:
     entry = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
     path = tmp_path / "constant.json"
     path.write_text(json.dumps({"ball": entry}))
-    assert load_constants(path)["ball"].action == (0.1,) * ACTION_DIM
+    assert load_constants(path, {})["ball"].action == (0.1,) * ACTION_DIM
 
 
 @pytest.mark.parametrize(
@@ -94,4 +94,4 @@ def test_a_file_of_another_format_is_refused(tmp_path: Path, content: str | None
     if content is not None:
         path.write_text(content)
     with pytest.raises(DataError, match=r"constant\.json"):
-        load_constants(path)
+        load_constants(path, {})

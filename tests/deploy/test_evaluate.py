@@ -97,6 +97,29 @@ def test_all_controllers_play_the_same_scenarios(
     assert "eval.json" in captured.out
 
 
+def test_constants_are_reused_with_the_same_controller_and_environment_only(
+    tmp_path: Path,
+    constant_file: Path,
+    short: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    flags = ["--controllers=constant", "--episodes=1", *short]
+    assert run(tmp_path / "old", f"--constant.path={constant_file}", *flags) == 0
+    assert "used unchecked" in capsys.readouterr().out
+    written = tmp_path / "old" / "constant.json"
+    assert run(tmp_path / "same", f"--constant.path={written}", *flags) == 0
+    assert "used unchecked" not in capsys.readouterr().out
+    assert played(tmp_path / "same") == played(tmp_path / "old")
+    longer = [*flags, "--env.ball_episode.ticks=16"]
+    assert run(tmp_path / "longer", f"--constant.path={written}", *longer) == 2
+    assert "env.ball_episode.ticks=15, expected 16" in capsys.readouterr().err
+    content = json.loads(written.read_text())
+    written.write_text(json.dumps(content | {"low_level_controller": "another"}))
+    assert run(tmp_path / "other", f"--constant.path={written}", *flags) == 2
+    assert "low_level_controller=another" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
 def test_results_do_not_depend_on_how_episodes_are_grouped(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:

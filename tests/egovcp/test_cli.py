@@ -11,7 +11,8 @@ from typing import Any, Literal
 import draccus
 import pytest
 
-from egovcp.cli import DatasetConfig, parse_config, run_command, save_config
+from egovcp.cli import parse_config, run_command, save_config
+from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import (
     ArtifactError,
     DataError,

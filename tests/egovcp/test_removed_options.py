@@ -9,7 +9,7 @@ import pytest
 
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
-from egovcp.removed_options import REMOVED_OPTIONS
+from egovcp.removed_options import PROGRAMS, REMOVED_OPTIONS, RENAMED_OPTIONS
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,29 @@ class Config:
     """Its data."""
 
 
-def _error(*argv: str) -> str:
+def _error(*argv: str, prog: str = "egovcp-test") -> str:
     with pytest.raises(UsageError) as caught:
-        parse_config(Config, argv, "egovcp-test")
+        parse_config(Config, argv, prog)
     return str(caught.value)
 
 
 @pytest.mark.parametrize("name", REMOVED_OPTIONS)
 def test_removed_flag_is_refused_with_its_reason(name: str) -> None:
-    assert _error(f"--{name}=1") == f"option --{name} was removed: {REMOVED_OPTIONS[name]}"
+    (prog, *_) = PROGRAMS.get(name, ("egovcp-test",))
+    error = _error(f"--{name}=1", prog=prog)
+    assert error == f"option --{name} was removed: {REMOVED_OPTIONS[name]}"
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_flag_that_another_program_had_is_unknown(name: str) -> None:
+    assert f"unknown option --{name}" in _error(f"--{name}=1")
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED_OPTIONS.items())
+def test_renamed_flag_is_refused_with_its_new_name(old: str, new: str) -> None:
+    error = _error(f"--{old}=1")
+    assert error.startswith(f"option --{old} was renamed to {new}")
+    assert ("--config_path" in error) == new.startswith("policy.loss.")
 
 
 def test_flag_within_a_removed_group_is_refused_with_the_reason_of_the_group() -> None:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pytest
 
-from egovcp.cli import DatasetConfig
+from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError
 from egovcp.subcommands import CommandGroup, Subcommand
 

@@ -32,6 +32,9 @@ def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_trains_and_resumes(theirs: Path, arguments: Arguments, tmp_path: Path) -> None:
     run = tmp_path / "run"
+    too_long = arguments(run, NAMES, dataset__root=theirs, returns__steps=500)
+    assert main(too_long) == 3  # after the conversion, whose result is removed
+    assert not list(run.iterdir())
     assert main(arguments(run, NAMES, dataset__root=theirs)) == 0
     artifact = load_artifact(run / "checkpoints/last/pretrained_model")
     robot = artifact.robot
@@ -51,6 +54,8 @@ def test_trains_and_resumes(theirs: Path, arguments: Arguments, tmp_path: Path) 
         (("--datasets=[{root: x}]",), "--features is for the --dataset of a new run"),
         (("--returns.weights={hit: 2.0}",), "one reward, without named terms"),
         (("--features={reward: rewrad}",), "did you mean 'reward'?"),
+        (("--sampling.tasks={push: -1}",), "a weight of -1"),
+        (("--resume",), "--features is for the --dataset of a new run"),
     ],
 )
 def test_refusals(
@@ -66,6 +71,17 @@ def test_refusals(
     assert main(arguments(run, NAMES, **root) + list(flags)) == 2
     assert problem in capsys.readouterr().err
     assert not run.exists()
+
+
+def test_resuming_with_features_keeps_the_run(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = tmp_path / "dataset" / "kept"
+    kept.parent.mkdir()
+    kept.touch()
+    assert main(arguments(tmp_path, NAMES, "--resume")) == 2
+    assert "of a new run" in capsys.readouterr().err
+    assert kept.exists()
 
 
 def test_a_dataset_with_other_features_names_the_option(

@@ -5,7 +5,9 @@ import re
 import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -15,6 +17,7 @@ from egovcp.checks import check_artifact
 from egovcp.hub import RetryPolicy
 from egovcp.manifest import PROCESSORS
 from egovcp.plan import PlannerConfig
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.testing import toy_model
 from egovcp_train import publish as publishing
 from egovcp_train.publish import main as push
@@ -86,6 +89,39 @@ def test_the_card_says_what_the_manifest_knows(
     assert "training.png" not in card, "nothing was recorded, so there is no picture"
 
 
+def _card(path: Path, robot: RobotSpec, **provenance: Any) -> tuple[dict[str, Any], str]:
+    """Front matter and text of the card of a policy."""
+    facts = {"controller_id": "servo-1", "heldout": {"object_rmse_m": 0.1}, **provenance}
+    save_artifact(path, toy_model(robot=robot), PlannerConfig(), facts)
+    _, front, text = publishing.card_text(load_artifact(str(path)), "me/policy").split("---", 2)
+    return yaml.safe_load(front), text
+
+
+def test_the_card_of_another_robot_does_not_describe_the_g1(tmp_path: Path) -> None:
+    front, text = _card(tmp_path / "arm", replace(G1, robot_type="arm"), tasks=["push the cube"])
+    assert front["tags"] == ["egovcp", "LeRobot", "arm", "depth", "world-model"]
+    assert "A policy for robot `arm`" in text
+    for word in ("G1", "hands", "in simulation only", "--task=push"):
+        assert word not in text
+    front, text = _card(tmp_path / "g1", G1, tasks=["ball"])
+    assert {"unitree_g1", "humanoid"} <= set(front["tags"])
+    assert "A policy for the Unitree G1 humanoid" in text
+    assert "--task=ball" in text
+
+
+def test_the_card_credits_metrics_to_a_single_dataset_only(tmp_path: Path) -> None:
+    one = {"repo_id": "me/a", "revision": "abc", "episodes": ""}
+    front, text = _card(tmp_path / "one", G1, datasets=[one])
+    (model,) = front["model-index"]
+    assert model["results"][0]["dataset"]["name"] == "me/a"
+    assert "| `object_rmse_m` | 0.1 | root mean squared error" in text
+    both = [one, {"repo_id": "", "revision": "", "episodes": ""}]
+    options = {"datasets": [{"repo_id": "me/a"}, {"root": "data/local"}]}
+    front, text = _card(tmp_path / "both", G1, datasets=both, train_config=options)
+    assert "model-index" not in front
+    assert "| dataset | a local folder, `local` |" in text
+
+
 def test_a_run_that_is_not_published_has_its_card_too(arguments: Arguments, tmp_path: Path) -> None:
     assert train(arguments(tmp_path / "run", steps=1)) == 0
     card = (_last(tmp_path / "run") / "README.md").read_text(encoding="utf-8")
@@ -134,6 +170,7 @@ def test_a_missing_login_is_refused_before_training(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("HF_TOKEN")
+    monkeypatch.setattr("egovcp_train.train.open_readers", lambda _: pytest.fail("reads data"))
     run = tmp_path / "run"
     _refused(arguments(run, *TO_HUB), run, 5, capsys, "not logged in.*hf auth login")
 

@@ -16,6 +16,7 @@ import torch
 
 from egovcp.artifact import load_artifact
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.model import Batch
 from egovcp.model.privileged_value import PrivilegedValue
 from egovcp_train import checkpoint, privileged_value
@@ -235,6 +236,26 @@ def test_resuming_a_finished_run_changes_no_checkpoint(finished: Path, tmp_path:
     assert _equal(_state(output), _state(finished))
     before = sorted(p.name for p in (finished / "checkpoints").iterdir())
     assert sorted(p.name for p in (output / "checkpoints").iterdir()) == before
+
+
+@pytest.mark.parametrize("flag", ["--resume=true", "--resume=Yes", "--resume=on"])
+def test_resume_takes_the_stored_options_for_every_boolean(tmp_path: Path, flag: str) -> None:
+    (tmp_path / checkpoint.CONFIG_FILE).write_text("steps: 123\n")
+    argv = [f"--output_dir={tmp_path}", flag]
+    assert checkpoint.resumed_options(TrainConfig, argv) == {"steps": 123}
+    assert checkpoint.resumed_options(TrainConfig, [*argv, "--resume=off"]) == {}
+    with pytest.raises(UsageError, match=r"--resume=2: expected bool"):
+        checkpoint.resumed_options(TrainConfig, [*argv, "--resume=2"])
+
+
+def test_a_full_memory_is_not_reported_as_a_wrong_option(tmp_path: Path) -> None:
+    with pytest.raises(torch.OutOfMemoryError), checkpoint.restoring(tmp_path):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+    with (
+        pytest.raises(ArtifactError, match=r"not fit .* \(KeyError: 'step'\)"),
+        checkpoint.restoring(tmp_path),
+    ):
+        raise KeyError("step")
 
 
 # --- refusals -------------------------------------------------------------------------------

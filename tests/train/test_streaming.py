@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from egovcp.artifact import load_artifact
-from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, DatasetWriter, Provenance
 from egovcp.data.source import lerobot_home
+from egovcp.dataset_options import DatasetConfig
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state

@@ -21,7 +21,7 @@ import torch
 
 from egovcp.artifact import load_artifact
 from egovcp.cli import given_options
-from egovcp.data.files import sync, sync_tree
+from egovcp.data.dataset_files import sync, sync_tree
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.files import UnsafeFileError, open_regular, read_text, removed_on_error, sha256
 from egovcp.flags import read_config
@@ -29,7 +29,7 @@ from egovcp.model import WorldModel
 from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.outputs import require_writable
 from egovcp.removed_options import RemovedOptionError
-from egovcp.values import build
+from egovcp.values import build, convert
 
 CONFIG_FILE: Final = "train_config.yaml"
 STATE_FILE: Final = "state.pt"
@@ -48,11 +48,11 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
         argv: its flags, ``--name=value`` each.
 
     Raises:
-        UsageError: a config file is given as well.
+        UsageError: ``--resume`` is not a boolean, or a config file is given as well.
         ArtifactError: the stored options cannot be read.
     """
     given = given_options(argv)
-    if "--resume" not in argv and given.get("resume", "").lower() != "true":
+    if not convert(bool, given.get("resume", "false"), "--resume"):
         return {}
     if "config_path" in given:
         raise UsageError(
@@ -100,8 +100,8 @@ def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Pat
     """
     output = Path(output_dir)
     if resume:
-        load_training_state(output)
-        return output
+        with _open_training_state(output):  # loaded later
+            return output
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         remedy = ", or continue the run in it with --resume" if resumable else ""
         raise UsageError(f"output folder {output} exists and is not empty; choose another{remedy}")
@@ -159,6 +159,14 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
     Raises:
         ArtifactError: there is none, or it cannot be read.
     """
+    with _open_training_state(output_dir) as file:
+        return _load(file)
+
+
+@contextmanager
+def _open_training_state(output_dir: Path) -> Iterator[IO[bytes]]:
+    """The file of the last training state, whose SHA-256 is the stored one; raises as
+    `load_training_state`."""
     path = output_dir / "checkpoints" / "last" / "training_state" / STATE_FILE
     if not os.path.lexists(path):
         raise ArtifactError(
@@ -168,7 +176,7 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
     try:
         _require_digest(path)
         with open_regular(path, _LIMIT_BYTES) as file:
-            return _load(file)
+            yield file
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ArtifactError(
@@ -186,8 +194,10 @@ def restoring(output_dir: Path) -> Iterator[None]:
     """
     try:
         yield
+    except torch.OutOfMemoryError:
+        raise
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise ArtifactError(
             f"{output_dir}: its checkpoint does not fit the options given ({reason}); resume "
             "without them, or start a new run"

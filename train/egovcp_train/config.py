@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Final, Literal
 
 from egovcp import spec
 from egovcp.bounds import MAX_PER_CORE, bounded
-from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import ReturnConfig, ShuffleConfig
+from egovcp.dataset_options import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.errors import UsageError, suggest
 from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import PRESETS as MODELS
@@ -195,7 +195,7 @@ class TrainConfig:
     save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
     threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
-    """CPU threads; 0: all cores."""
+    """CPU threads; 0: PyTorch's default, usually one per physical core."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"

@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import (
     DatasetReader,
     EpisodeIndex,
@@ -31,6 +30,7 @@ from egovcp.data.lerobot import is_own
 from egovcp.data.samplers import PrefetchIterator
 from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root, locate
+from egovcp.dataset_options import DatasetConfig, SelectedDatasetConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
@@ -38,11 +38,12 @@ from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
 
 EVALUATION_EPISODES: Final = 512
-"""Held-out episodes of each task; with fewer, R2 of Q depends on which ones they are."""
+"""At most this many held-out episodes of each task; with fewer, R2 of Q depends on which ones they
+are."""
 FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
     spec.STATE_DIM + 2 * spec.ACTION_DIM + 8
 )
-"""Of the G1; that of another robot is of the same order."""
+"""Bytes per frame of the G1, an estimate for other robots."""
 
 _RETURNS: Final = ReturnConfig()
 
@@ -61,9 +62,27 @@ class TrainingData:
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
-    learning: Callable[[], EpisodeStore]
-    """Reads the training episodes; those that are not in memory without images, and of a dataset
-    on the Hub a sample of the files."""
+    training_episodes: Callable[[], EpisodeStore]
+    """Returns the training episodes: those in memory, or in mode stream without images (of a
+    dataset on the Hub, those of some files)."""
+
+
+def check_options(config: TrainConfig) -> None:
+    """Raise `UsageError` for options of the data that contradict each other; no data is read."""
+    if config.features and (config.datasets or config.resume):
+        raise UsageError(
+            "--features is for the --dataset of a new run; leave it out with --datasets, which "
+            "takes converted ones, and with --resume"
+        )
+    if config.features and config.returns.weights:
+        raise UsageError(
+            "--returns.weights: a dataset with --features has one reward, without named terms; "
+            "leave the weights out"
+        )
+    mix_of(config)
+    sampler_config(config).check()
+    config.loading.shuffle.check()
+    config.returns.check()
 
 
 def prepare(
@@ -79,10 +98,6 @@ def prepare(
         DataError: a dataset is damaged, or not finite.
         EnvironmentFailure: the Hub cannot be reached.
     """
-    mix, sampling = mix_of(config), stream_config(config)
-    sampling.check()
-    config.loading.shuffle.check()
-    config.returns.check()
     for reader in readers:
         if config.returns.weights and spec.REWARD_TERMS_KEY not in reader.features:
             raise UsageError(
@@ -93,31 +108,21 @@ def prepare(
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
+    mix, sampling = mix_of(config), sampler_config(config)
     return TrainingData(readers, config, *build(readers, config, sampling, mix, model))
 
 
-def converted(config: TrainConfig) -> TrainConfig:
-    """The options with OUTPUT_DIR/dataset as the dataset, into which the one that has other
-    features is converted; unchanged without ``features``.
+def convert_if_needed(config: TrainConfig) -> TrainConfig:
+    """Convert --dataset to OUTPUT_DIR/dataset if --features is given; return options that name the
+    result.
 
     Raises:
-        UsageError: --datasets or --returns.weights is given too, or the dataset has no such
-            features.
+        UsageError: the dataset has no such features.
         DataError: it is missing or damaged.
         EnvironmentFailure: the Hub cannot be reached.
     """
     if not config.features:
         return config
-    if config.datasets or config.resume:
-        raise UsageError(
-            "--features is for the --dataset of a new run; leave it out with --datasets, which "
-            "takes converted ones, and with --resume"
-        )
-    if config.returns.weights:
-        raise UsageError(
-            "--returns.weights: a dataset with --features has one reward, without named terms; "
-            "leave the weights out"
-        )
     root = Path(config.output_dir).absolute() / "dataset"
     source = locate(config.dataset, config.loading.network)
     convert_dataset(source, config.features, root, config.dataset.episodes)
@@ -217,7 +222,7 @@ def mix_of(config: TrainConfig) -> Mix:
     return mix
 
 
-def stream_config(config: TrainConfig) -> SamplerConfig:
+def sampler_config(config: TrainConfig) -> SamplerConfig:
     """How windows are drawn."""
     own = config.sampling
     return SamplerConfig(config.batch_size, own.length, own.burn_in, own.mirror, seed=config.seed)
@@ -239,13 +244,13 @@ def _in_memory(
     mix: Mix,
     model: WorldModel,
 ) -> Built:
-    learning, heldout = (
+    training, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
-    _require_returns(readers, learning)
-    set_normalisation(model, learning, config.returns)
-    stream = PrefetchIterator(InMemorySampler(learning, sampling, mix))
-    return stream, heldout, lambda: learning
+    _require_returns(readers, training)
+    set_normalisation(model, training, config.returns)
+    stream = PrefetchIterator(InMemorySampler(training, sampling, mix))
+    return stream, heldout, lambda: training
 
 
 def _on_disk(
@@ -255,25 +260,25 @@ def _on_disk(
     mix: Mix,
     model: WorldModel,
 ) -> Built:
-    learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
-    sample = learning
-    if learning.is_remote:
-        sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
+    training, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
+    sample = training
+    if training.is_remote:
+        sample, unseen = sample_files(training, unseen, config.loading.sample_files)
         for part in (sample, unseen):
             part.download()
     heldout = EpisodeStore.read(unseen.subsample(EVALUATION_EPISODES), config.returns)
     without_images = partial(EpisodeStore.read, sample, config.returns, images=False)
     store = without_images()
     _require_returns(readers, store)
-    state = learning.state_statistics() if learning.is_remote else None
+    state = training.state_statistics() if training.is_remote else None
     set_normalisation(model, store, config.returns, state)
     stream = StreamingSampler(
-        learning,
+        training,
         sampling,
         mix,
         config.loading.shuffle,
         config.returns,
-        checked=not learning.is_remote,
+        checked=not training.is_remote,
     )
     return PrefetchIterator(stream), heldout, without_images
 

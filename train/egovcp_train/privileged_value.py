@@ -336,7 +336,7 @@ def prepare(
         return None
     critic = fit(
         model,
-        data.learning(),
+        data.training_episodes(),
         config.optimizer.privileged_value,
         config.planner,
         config.seed,

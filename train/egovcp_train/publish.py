@@ -6,8 +6,8 @@ import platform
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import version
 from importlib.resources import files
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,7 +26,8 @@ from egovcp.hub import (
     publish,
 )
 from egovcp.outputs import write_report
-from egovcp.packages import SIMULATOR_MODULES, is_installed
+from egovcp.packages import SIMULATOR_MODULES, is_installed, versions_of
+from egovcp.robot_spec import RobotSpec
 from egovcp.terminal import echo
 from egovcp_train.config import PolicyConfig
 
@@ -36,13 +37,14 @@ CARD: Final = "README.md"
 ASSETS: Final = "assets"
 CURVES: Final = f"{ASSETS}/training.png"
 _PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "numpy")
-#: Prefix of a metric's name -> its meaning; the longest prefix applies.
+#: Metric -> its meaning.
 _METRICS: Final = {
     "value/r2": "share of the variance of its target that Q explains",
     "value/slope": "regression of the target on Q; 1 is calibrated",
     "value/ranking": "correlation of the advantages of actions by Q and by its target",
     "latent/active": "dimensions of z that carry information",
     "latent/kl": "KL divergence of posterior and prior, nats per step",
+    "object_rmse_m": "root mean squared error of the decoded position of the object",
 }
 #: Title of a panel -> label of a curve -> scalar.
 _PANELS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -90,7 +92,7 @@ def push(config: PolicyPushConfig) -> None:
         ArtifactError: the artifact is damaged.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    if not policy_folder(config.policy.path).is_dir() or not config.policy.path:
+    if not config.policy.path or not policy_folder(config.policy.path).is_dir():
         raise UsageError(
             f"--policy.path={config.policy.path!r}: expected the folder of an artifact, such as "
             "runs/ball/checkpoints/last/pretrained_model"
@@ -165,7 +167,7 @@ def report(target: Publication, published: Published) -> None:
 # --- card ----------------------------------------------------------------------------
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that training depends on."""
-    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+    return {"python": platform.python_version(), **versions_of(_PACKAGES)}
 
 
 def write_card(folder: Path, run: Path, repo_id: str) -> None:
@@ -190,20 +192,21 @@ def card_text(artifact: Artifact, repo_id: str) -> str:
     """
     from huggingface_hub import ModelCard
 
-    manifest = artifact.manifest
+    manifest, robot = artifact.manifest, artifact.robot
     command = manifest.get("command")
     found_versions = manifest.get("versions") or {"egovcp": manifest["egovcp_version"]}
     folder = artifact.path.resolve()
     local = folder.name if folder.parent == PRETRAINED.resolve() else str(artifact.path)
     title = repo_id.partition("/")[2] or "egovcp policy"
     card = ModelCard.from_template(
-        _front_matter(manifest, title),
+        _front_matter(manifest, title, robot),
         template_str=(files(__package__) / "model_card.md").read_text(encoding="utf-8"),
         title=title,
         name=repo_id or local,
         on_hub=bool(repo_id),
+        other_robot="" if robot.is_g1 else robot.robot_type,
         tasks=[(task, _about(task)) for task in manifest.get("tasks", [])],
-        datasets=[_dataset(d, manifest) for d in manifest.get("datasets", [])],
+        datasets=_datasets(manifest),
         controller_id=artifact.controller_id,
         step=manifest.get("step", "an unknown number of"),
         command=shlex.join(command) if command else "not recorded",
@@ -229,10 +232,11 @@ def _about(task: str) -> str:
     return describe_task(task)
 
 
-def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:
+def _front_matter(manifest: Mapping[str, Any], title: str, robot: RobotSpec) -> Any:
     from huggingface_hub import EvalResult, ModelCardData
 
-    datasets = [d for d in manifest.get("datasets", []) if d.get("revision")]  # those on the Hub
+    datasets = manifest.get("datasets", [])
+    on_hub = [d for d in datasets if d.get("revision")]
     results = [
         EvalResult(
             task_type="robotics",
@@ -244,17 +248,23 @@ def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:
             metric_value=value,
         )
         for name, value in sorted(_metrics(manifest).items())
-        if datasets
+        if on_hub and len(datasets) == 1  # a result names one dataset
     ]
     return ModelCardData(
         license="apache-2.0",
         library_name="egovcp",
         pipeline_tag="robotics",
-        tags=["egovcp", "LeRobot", "unitree_g1", "humanoid", "depth", "world-model"],
-        datasets=[d["repo_id"] for d in datasets] or None,
+        tags=["egovcp", "LeRobot", *_robot_tags(robot), "depth", "world-model"],
+        datasets=[d["repo_id"] for d in on_hub] or None,
         model_name=title if results else None,
         eval_results=results or None,
     )
+
+
+def _robot_tags(robot: RobotSpec) -> list[str]:
+    if robot.is_g1:
+        return [robot.robot_type, "humanoid"]
+    return [robot.robot_type] if robot.robot_type != "unknown" else []
 
 
 def _metrics(manifest: Mapping[str, Any]) -> dict[str, float]:
@@ -262,10 +272,18 @@ def _metrics(manifest: Mapping[str, Any]) -> dict[str, float]:
     return {k: float(v) for k, v in manifest.get("heldout", {}).items() if v is not None}
 
 
-def _dataset(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, str]:
-    root = manifest.get("train_config", {}).get("dataset", {}).get("root", "")
-    names = ("repo_id", "revision", "episodes")
-    return {**{name: entry.get(name) or "" for name in names}, "root": Path(root).name}
+def _datasets(manifest: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Id, commit, episodes and name of the folder of each dataset; empty text for what is not
+    recorded."""
+    options, names = manifest.get("train_config", {}), ("repo_id", "revision", "episodes")
+    given = options.get("datasets") or [options.get("dataset") or {}]
+    return [
+        {name: entry.get(name) or "" for name in names}
+        | {"root": Path(option.get("root") or "").name}
+        for entry, option in zip(
+            manifest.get("datasets", []), chain(given, repeat({})), strict=False
+        )
+    ]
 
 
 # --- training curves -----------------------------------------------------------------

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ from egovcp.artifact import save_artifact
 from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.files import removed_on_error
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
@@ -43,7 +45,8 @@ from egovcp_train.datasets import (
     EVALUATION_EPISODES,
     FRAME_BYTES,
     TrainingData,
-    converted,
+    check_options,
+    convert_if_needed,
     open_readers,
     prepare,
     require_datasets,
@@ -100,10 +103,20 @@ def train(config: TrainConfig) -> None:
     bf16 = choose_bf16(config.mixed_precision, device)
     _require_batch_memory(config, device)
     output = _prepare_output(config)
+    reserve_policy(config.policy)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    config = converted(config)
+    is_converted, config = bool(config.features), convert_if_needed(config)
+    with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
+        run = _prepare_run(config, output, device, bf16)
+    run.execute()
+
+
+def _prepare_run(
+    config: TrainConfig, output: Path, device: torch.device, bf16: bool
+) -> TrainingRun:
+    """Load the data, build or restore the learner, and write the options of the run."""
     readers = open_readers(config)
     robot = readers[0].robot
     model = WorldModel(config.policy.world_model(robot), robot)
@@ -128,10 +141,9 @@ def train(config: TrainConfig) -> None:
         make_evaluator(model, config.planner)  # refuses a backend that cannot be used here
         tasks, controller = provenance["tasks"], provenance["controller_id"]
         simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
-    reserve_policy(config.policy)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    TrainingRun(config, output, learner, data, device, provenance, simulation, spent).execute()
+    return TrainingRun(config, output, learner, data, device, provenance, simulation, spent)
 
 
 def _require_one_process() -> None:
@@ -314,6 +326,7 @@ def _prepare_output(config: TrainConfig) -> Path:
     for flag, wanted in (("wandb.enable", config.wandb.enable), ("trackio", config.trackio)):
         if wanted:
             require_packages("egovcp-train", f"--{flag}", flag.partition(".")[0])
+    check_options(config)
     try:
         tensor_shapes(config.policy.world_model())
     except ValueError as error:

@@ -10,8 +10,8 @@ from typing import Final
 from egovcp.checks import check_dataset
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
+from egovcp.data.dataset_files import sync_tree
 from egovcp.data.destination import require_new, resolve_root, writer_lock
-from egovcp.data.files import sync_tree
 from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source, read_source, write_source
 from egovcp.data.writer import publish_version

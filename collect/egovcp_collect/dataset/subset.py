@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from egovcp.checks.feature_statistics import Statistics, describe
 from egovcp.checks.lerobot_dataset import LeRobotCheck
-from egovcp.data import files, schema
+from egovcp.data import dataset_files, schema
 from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
@@ -76,7 +76,7 @@ def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
     for row in reader.rows:
         if row.index not in seen:
             seen.add(row.index)
-            yield DataError.at(row.data, "its rows cannot be read", row.index)
+            yield DataError.at(row.data_path, "its rows cannot be read", row.index)
 
 
 def _examine(
@@ -94,7 +94,7 @@ def _examine(
         if isinstance(found, DataError):
             yield found
         else:
-            yield SoundEpisode(replace(row, data=path), table, found)
+            yield SoundEpisode(replace(row, data_path=path), table, found)
 
 
 def _named_tasks(reader: LeRobotReader) -> dict[int, str]:
@@ -161,12 +161,12 @@ class SubsetWriter:
             at = table.schema.get_field_index(name)
             field = table.schema.field(at)
             table = table.set_column(at, field, pa.array(values, field.type))
-        if episode.row.data != self._source:  # one file for each of the source
+        if episode.row.data_path != self._source:  # one file for each of the source
             self._close()
             path = self._folder / self._data_path(self._files)
             path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = pq.ParquetWriter(path, table.schema, compression="snappy")
-            self._source, self._files = episode.row.data, self._files + 1
+            self._source, self._files = episode.row.data_path, self._files + 1
         assert self._writer is not None
         self._writer.write_table(table, row_group_size=count)
         self._rows.append(self._row(episode, number, count))
@@ -191,8 +191,8 @@ class SubsetWriter:
             key: {**{name: v.tolist() for name, v in value.items()}, "count": [counts[key]]}
             for key, value in total.items()
         }
-        files.write_json(self._folder / schema.INFO_PATH, info)
-        files.write_json(self._folder / schema.STATS_PATH, stats)
+        dataset_files.create_json(self._folder / schema.INFO_PATH, info)
+        dataset_files.create_json(self._folder / schema.STATS_PATH, stats)
         frame = pd.DataFrame({"task_index": list(tasks.values())}, pd.Index(tasks, name="task"))
         frame.to_parquet(self._folder / schema.TASKS_PATH)
         path = self._folder / schema.EPISODES_PATH.format(chunk_index=0, file_index=0)

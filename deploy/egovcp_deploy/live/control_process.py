@@ -1,7 +1,9 @@
 """The control process: runs the 50 Hz loop on the robot and outlives the planner.
 
 It owns the connection to the robot. If the planner's process ends or hangs, the robot is held.
-However this process itself ends, its last commands damp the motors.
+On a normal exit, an exception or a signal that can be handled its last commands damp the motors. If
+it is killed, the watchdog of the planner's process does; if both are gone, the motors keep the last
+command.
 """
 
 from __future__ import annotations
@@ -30,8 +32,13 @@ from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.bridge import BridgeRobot
 
 #: Real-time priorities of threads that receive, and of the loop. The kernel's own threads have 50.
-RECEIVING: Final = 10
-CONTROL: Final = 20
+RECEIVER_PRIORITY: Final = 10
+CONTROL_PRIORITY: Final = 20
+NO_PRIORITY: Final = (
+    "no real-time priority: other programs may delay the balance; add the line "
+    f"'USER - rtprio {CONTROL_PRIORITY}' to /etc/security/limits.conf, and log in again"
+)
+_STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _NICE: Final = -10
 _ORPHAN_TICKS: Final = 100  # the process of a damped robot without a planner ends after 2 s
 _DAMPING_COMMANDS: Final = 10  # at the end of the process
@@ -40,13 +47,14 @@ _SWITCH_S: Final = 0.001  # longest wait of the loop for a receiving thread
 
 
 def control_process(setup: ControlSetup) -> None:
-    """Main function of the process; returns on a quit command, on SIGTERM, or if not needed."""
+    """Main function of the process; returns on a quit command, on SIGTERM, SIGHUP or SIGQUIT, or
+    2 s after the planner's process has ended, once the motors are damped."""
     os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
-    with stop_on_signal(signals=(signal.SIGTERM,), interrupt=False) as stopping:
+    with stop_on_signal(signals=_STOP_SIGNALS, interrupt=False) as stopping:
         sys.setswitchinterval(_SWITCH_S)
         # Before there are threads: one that holds the interpreter's lock must not be preempted.
-        raise_priority(RECEIVING)
+        raise_priority(RECEIVER_PRIORITY)
         try:
             hardware = open_hardware(setup.bridge, setup.camera)
         except EgovcpError as error:
@@ -56,7 +64,8 @@ def control_process(setup: ControlSetup) -> None:
         with closing(hardware), closing(Link(setup.address, serve=False)) as link:
             try:
                 control = ControlProcess(setup, hardware, link)
-                raise_priority(CONTROL)
+                if not raise_priority(CONTROL_PRIORITY):
+                    control.warn(f"warning: {NO_PRIORITY}")
                 gc.freeze()  # imported objects are not searched for garbage again
                 control.run(stopping)
             finally:
@@ -83,6 +92,11 @@ class ControlProcess:
         self._remote = RemoteOperator()
         self._orphaned = 0
 
+    def warn(self, line: str) -> None:
+        """Print ``line`` and add it to the events of the run, without blocking."""
+        print_without_blocking(f"egovcp-deploy: {line}")
+        self._loop.pilot.add_events([line])
+
     def run(self, stopping: Sequence[int]) -> None:
         """Run until a quit command, or until ``stopping`` is not empty."""
         rate = FixedRate(CONTROLLER_HZ, MonotonicClock())
@@ -103,24 +117,33 @@ class ControlProcess:
             return
         idle = self._loop.state in (State.INIT, State.DAMP)
         if self._planner.alive and not idle:
-            with suppress(OSError):  # the terminal may be closed
-                echo(
-                    "egovcp-deploy: the planner's process has ended; the robot is held until it is "
-                    f"damped: by kill {os.getpid()}, or by L1 + B on its remote control",
-                    error=True,
-                )
+            self.warn(
+                "the planner's process has ended; the robot is held until it is damped: by kill "
+                f"{os.getpid()}, or by L1 + B on its remote control"
+            )
         self._planner.alive = False
         self._orphaned += idle
 
 
 def merged(commands: Sequence[OperatorCommand]) -> OperatorCommand:
-    """The commands of one tick as one: an emergency stop if there is any, else the last values."""
-    request, velocity = None, None
-    for command in commands:
-        velocity = command.velocity or velocity
-        if request is not OperatorRequest.ESTOP:
-            request = command.request or request
-    return OperatorCommand(request, velocity)
+    """The commands of one tick as one, with the last velocity. The request is an emergency stop if
+    there is one, else a hold if there is one, else the last."""
+    requests = [command.request for command in commands if command.request]
+    velocities = [command.velocity for command in commands if command.velocity]
+    urgent = [r for r in (OperatorRequest.ESTOP, OperatorRequest.HOLD) if r in requests]
+    request = next(iter([*urgent, *reversed(requests)]), None)
+    return OperatorCommand(request, velocities[-1] if velocities else None)
+
+
+def print_without_blocking(line: str) -> None:
+    """Print on stderr in a daemon thread: a stopped terminal or a full pipe blocks the writer."""
+
+    def write() -> None:
+        with suppress(OSError):  # the terminal may be closed
+            # Not `echo`, which would hold the lock of sys.stderr; the exit of the process needs it.
+            os.write(sys.stderr.fileno(), f"{one_line(line)}\n".encode())
+
+    threading.Thread(target=write, daemon=True).start()
 
 
 def damp_motors(body: BridgeRobot) -> None:

@@ -29,6 +29,7 @@ from egovcp_deploy.recording import (
     missing_ticks,
     open_viewer,
     percentiles,
+    print_viewer_command,
     provenance,
     recording,
     run_info,
@@ -99,7 +100,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
         f"computed by {info.backend}{skipped}"
     )
-    echo(f"view it with: rerun {folder / 'rollout-0.rrd'}")
+    print_viewer_command(folder / "rollout-0.rrd")
     _raise_failure(summary, folder)
 
 

@@ -23,7 +23,7 @@ from egovcp_deploy.robots.wire import RemoteControl
 if TYPE_CHECKING:
     from egovcp_deploy.config import OperatorOptions
 
-EASE_S: Final = 2.0  # from HOLD until the hands are in the neutral pose
+EASE_S: Final = 2.0  # from HOLD to the end of a run; the hands ease to neutral in up to 1 s
 _VELOCITY_PERIOD_S: Final = 0.1
 _REQUEST_PERIOD_S: Final = 0.5  # of a refused request; a shorter one only fills the log
 

@@ -1,4 +1,4 @@
-"""`egovcp-mcap`: inspect recorded runs, recover torn ones, convert them to datasets."""
+"""`egovcp-mcap`: inspect recorded runs, recover truncated ones, convert them to datasets."""
 
 from typing import Final
 
@@ -6,16 +6,16 @@ from egovcp.subcommands import CommandGroup, Subcommand
 
 COMMANDS: Final = CommandGroup(
     "egovcp-mcap",
-    "Inspect recorded runs (MCAP), recover torn ones, convert them to datasets.",
+    "Inspect recorded runs (MCAP), recover truncated ones, convert them to datasets.",
     {
         "info": Subcommand(
             "egovcp_deploy.mcap.info:run",
-            "its content: run, ticks, rates, topics, gaps; complete or torn",
+            "its content: run, ticks, rates, topics, gaps; complete or truncated",
             ("file",),
         ),
         "recover": Subcommand(
             "egovcp_deploy.mcap.recover:run",
-            "copy every complete tick of a torn file to a new one with an index",
+            "copy every complete tick of a truncated file to a new one with an index",
             ("file", "output"),
         ),
         "to-dataset": Subcommand(

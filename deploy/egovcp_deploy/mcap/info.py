@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -104,7 +105,7 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
 
 def as_text(report: dict[str, Any]) -> list[str]:
     """The report of `summarise` as lines of text."""
-    condition = "complete" if report["complete"] else "TORN"
+    condition = "complete" if report["complete"] else "TRUNCATED"
     if report["damaged"]:
         condition = f"DAMAGED, {report['lost']}"
     run = report["run"]
@@ -139,8 +140,9 @@ def as_text(report: dict[str, Any]) -> list[str]:
     width = max(map(len, report["topics"]), default=0)
     for topic, each in report["topics"].items():
         lines.append(f"  {topic:{width}}  {each['messages']:6d}  {each['type']}")
-    if condition == "TORN":  # damage ends the command with an error
-        lines.append(f"recover its ticks: egovcp-mcap recover {report['file']} OUT.mcap")
+    if condition == "TRUNCATED":  # damage ends the command with an error
+        file = shlex.quote(report["file"])
+        lines.append(f"recover its ticks: egovcp-mcap recover {file} OUT.mcap")
     return lines
 
 

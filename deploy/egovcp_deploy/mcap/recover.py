@@ -1,4 +1,4 @@
-"""`egovcp-mcap recover`: copy the readable ticks of a torn or damaged recording."""
+"""`egovcp-mcap recover`: copy the readable ticks of a truncated or damaged recording."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from egovcp.terminal import echo
 
 @dataclass(frozen=True)
 class RecoverConfig:
-    """Copy all readable ticks of a torn or damaged recording into a new file with an index, and
-    report which ticks are lost. No existing file is changed."""
+    """Copy all readable ticks of a truncated or damaged recording into a new file with an index,
+    and report which ticks are lost. No existing file is changed."""
 
     file: str = ""
-    """The torn or damaged recording."""
+    """The truncated or damaged recording."""
     output: str = output_file()
     """The new recording."""
 
@@ -28,9 +28,9 @@ def run(config: RecoverConfig) -> None:
     """Copy the ticks and print how many were copied and lost. Raises `DataError` if it is not a
     recording of ours, `EnvironmentFailure` if the output exists or the disk is full."""
     if not config.file or not config.output:
-        raise UsageError("two files are needed; usage: egovcp-mcap recover TORN OUT")
+        raise UsageError("two files are needed; usage: egovcp-mcap recover TRUNCATED OUT")
     ticks, reader = recover(Path(config.file), Path(config.output))
-    state = "is torn: its end is missing" if reader.torn else "was already complete"
+    state = "is truncated: its end is missing" if reader.torn else "was already complete"
     if reader.damaged:
         torn = ", and its end is missing" if reader.torn else ""
         state = f"is damaged: {reader.loss_text()}{torn}"

@@ -13,7 +13,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from egovcp.cli import DatasetConfig
+from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
@@ -163,7 +163,7 @@ def provenance(paths: Sequence[Path]) -> Provenance:
 
 def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
     """Raise `DataError` if two recordings have the same rows, before anything is written. A copy
-    may end earlier: a torn recording that was recovered begins with the same rows."""
+    may end earlier: a truncated recording that was recovered begins with the same rows."""
     seen: list[tuple[Path, list[bytes]]] = []
     for path in paths:
         episode, _ = read_episode(path, gaps)
@@ -203,7 +203,7 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
         place = "" if str(error).startswith(str(path)) else f"{path}: "
         raise DataError(f"{place}{error}") from error
     cut = f", cut: {gap}" if gap else ""
-    return episode, cut if reader.complete else f"{cut}; the file is torn there"
+    return episode, cut if reader.complete else f"{cut}; the file is truncated there"
 
 
 def _episode_ticks(ticks: Iterator[Tick]) -> Iterator[Tick]:

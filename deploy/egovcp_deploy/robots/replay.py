@@ -1,8 +1,8 @@
 """Plays a recorded run back through a policy.
 
 Observations and sent actions are the recorded ones, whatever the policy plans. So its recurrence
-repeats the recorded run's bit for bit, and the run can be inspected again or shown to another
-model.
+repeats the recorded run's bit for bit, if no tick was dropped and the planner lost no observation,
+and the run can be inspected again or shown to another model.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError, UsageError
+from egovcp.log.async_sink import warn_on_stderr
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import CameraView
 from egovcp.robot_spec import RobotSpec
@@ -23,12 +24,16 @@ from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
 RECORDING_ENDS: Final = "recording ends"
+_CONTROLLER: Final = "low_level_controller"  # key of its identity
 
 
 class ReplayRobot:
-    """Robot in lock-step whose rollout i is the i-th of ``files``, MCAP files that may be torn. A
-    run on the wall clock begins at its first tick in RUN, where the policy's recurrence started.
-    Raises `DataError` if the first file is damaged or has no ticks."""
+    """Replays recording i of ``files`` as rollout i, in lockstep; a missing end is allowed. A live
+    recording starts at its first RUN tick, where the policy's recurrence started.
+
+    Raises:
+        DataError: the first file is damaged or has no ticks.
+    """
 
     def __init__(self, files: Sequence[Path]) -> None:
         self._files = files
@@ -43,7 +48,7 @@ class ReplayRobot:
     @property
     def controller_id(self) -> str:
         """Low-level controller of the recorded robot."""
-        return self._recording.info.hashes.get("low_level_controller", "")
+        return self._recording.info.hashes.get(_CONTROLLER, "")
 
     @property
     def spec(self) -> RobotSpec:
@@ -56,8 +61,8 @@ class ReplayRobot:
         return self._recording.info.camera
 
     def start(self, episode: int) -> None:
-        """Go to the beginning of recording ``episode``; raises `UsageError` if there is none,
-        `DataError` if it is damaged."""
+        """Go to the beginning of recording ``episode``; warns of missing ticks. Raises `UsageError`
+        if there is none, `DataError` if it is damaged or of another low-level controller."""
         if not 0 <= episode < self.count:
             raise UsageError(f"no recording {episode}; there are {self.count} recordings")
         if episode != self._number:
@@ -65,8 +70,20 @@ class ReplayRobot:
             recording = read_recording(path, damaged_ok=False)
             if not recording.ticks:
                 raise DataError(f"{path} has no ticks; there is nothing to play back")
+            found = recording.info.hashes.get(_CONTROLLER, "")
+            if self._number >= 0 and found != self.controller_id:
+                raise DataError(
+                    f"{path} was recorded with the low-level controller {found!r}, expected "
+                    f"{self.controller_id!r} as in the recordings before it; replay it separately"
+                )
             first = next((i for i, t in enumerate(recording.ticks) if t.mode == State.RUN), 0)
-            self._recording = replace(recording, ticks=recording.ticks[first:])
+            ticks = recording.ticks[first:]
+            if missing := ticks[-1].index - ticks[0].index + 1 - len(ticks):
+                warn_on_stderr(
+                    f"warning: {path}: {missing} ticks are missing, and the policy's recurrence "
+                    "differs from the recorded one after them; egovcp-mcap info lists the gaps"
+                )
+            self._recording = replace(recording, ticks=ticks)
             self._number = episode
         self._tick = 0
 

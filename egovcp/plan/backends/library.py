@@ -34,7 +34,7 @@ FLAGS: Final = (
     "-shared",
     "-fPIC",
 )
-WITHOUT_TILES: Final = "-DWITHOUT_TILES"
+WITHOUT_AMX: Final = "-DWITHOUT_AMX"
 FLOAT32_HINT: Final = "plan with --planner.backend=float32"
 
 
@@ -45,7 +45,7 @@ def _fields(kind: type, names: str) -> list[tuple[str, type]]:
     return [(name, kind) for name in names.split()]
 
 
-# Each structure mirrors the one of the kernel with the same name without C.
+# Each structure mirrors the kernel's structure of the same name without the prefix C.
 
 
 class CWide(ctypes.Structure):
@@ -179,7 +179,7 @@ def library() -> ctypes.CDLL:
         EnvironmentFailure: there is no compiler, or it fails, or another user can write to the
             cache folder.
     """
-    flags = (*FLAGS, WITHOUT_TILES) if tiles_are_refused() else FLAGS
+    flags = FLAGS if request_amx_tiles() else (*FLAGS, WITHOUT_AMX)
     name = f"planner-{_identity(flags)}.so"
     try:
         content = _cached(name, flags)
@@ -192,7 +192,7 @@ def library() -> ctypes.CDLL:
         raise EnvironmentFailure(
             f"the int8 planner cannot be compiled or loaded ({error}); {FLOAT32_HINT}"
         ) from error
-    for name, result, *arguments in (
+    for symbol, result, *arguments in (
         ("evaluate", None, _P),
         ("work", None, _P),
         ("draw", None, _I, _I, _I, _P, _P, _P, _P),
@@ -202,7 +202,7 @@ def library() -> ctypes.CDLL:
         ("missing_workers", _I, _P, _I),
         ("layout", None, _P, _P, _P),
     ):
-        function = getattr(kernel, name)
+        function = getattr(kernel, symbol)
         function.restype, function.argtypes = result, arguments
     return kernel
 
@@ -222,13 +222,13 @@ def layout(kernel: ctypes.CDLL) -> Layout:
     return Layout(*(x.value for x in found))
 
 
-def tiles_are_refused() -> bool:
-    """Whether the processor has AMX but Linux does not permit it to this process."""
+def request_amx_tiles() -> bool:
+    """Ask Linux to let this process use AMX; returns whether it may, and the processor has it."""
     if not processor_has("amx_int8"):
         return False
     arch_prctl, ask_for, tile_data = 158, 0x1023, 18  # <asm/prctl.h>: ARCH_REQ_XCOMP_PERM
     answer: int = ctypes.CDLL(None).syscall(arch_prctl, ask_for, tile_data)
-    return answer != 0
+    return answer == 0
 
 
 @cache

@@ -33,7 +33,7 @@ _HALF_EDGE: Final = (math.pi / 6) ** (1 / 3)  # of a cube, in radii of the ball 
 _TUMBLE: Final = 6.0  # rad/s, the most that a box turns about each axis
 # The oracle.
 _LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
-_BLOCK_AHEAD: Final = 0.32  # m, of the hand that waits for the ball from the pelvis
+_BLOCK_AHEAD: Final = 0.32  # m, distance from pelvis to the blocking hand
 _HAND_OFFSET: Final = (0.03, 0.0, 0.0)  # m, middle of the hand capsule from the palm site
 
 
@@ -90,7 +90,8 @@ class BallTask(Task):
         self.radius, self.flight = sampled["radius"], sampled["flight"]
         aim = (self.config.aim_forward, sampled["aim_lateral"], sampled["aim_height"])
         self._aim_b = np.array(aim)
-        self._turned, self._turning = self._attitude(scenario)
+        rotation = self._release_rotation(scenario)
+        self._release_orientation, self._release_angular_velocity = rotation
         self._thrown = False
         self._grounded = False  # on the floor: contacts no longer count
         self._blocked_at: float | None = None
@@ -107,7 +108,7 @@ class BallTask(Task):
         sphere = mujoco.mjtGeom.mjGEOM_SPHERE
         body.add_geom(name=BALL, type=sphere, size=[0.1, 0, 0], mass=0.25, contype=1, conaffinity=1)
 
-    def _attitude(self, scenario: Scenario) -> tuple[Array, Array]:
+    def _release_rotation(self, scenario: Scenario) -> tuple[Array, Array]:
         """Quaternion and angular velocity (rad/s) at the release; constant for a ball."""
         if not self._is_box:
             return np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
@@ -155,7 +156,10 @@ class BallTask(Task):
             return
         self._thrown = True
         start, velocity = self._throw()
-        self._set_ball(np.append(start, self._turned), np.append(velocity, self._turning))
+        self._set_ball(
+            np.append(start, self._release_orientation),
+            np.append(velocity, self._release_angular_velocity),
+        )
 
     def _throw(self) -> tuple[Array, Array]:
         """Release point and velocity, world, aimed at the robot as it stands now."""
@@ -223,7 +227,7 @@ class BallTask(Task):
         if not state.active:
             return np.zeros(7)
         t = _LOOKAHEAD[:, None]
-        path = self.object_b + self.to_body(state.velocity_w) * t + 0.5 * _GRAVITY * t * t
+        path = self.object_b + self.to_heading_frame(state.velocity_w) * t + 0.5 * _GRAVITY * t * t
         point = path[np.argmin(np.abs(path[:, 0] - _BLOCK_AHEAD))]
         target = point - _HAND_OFFSET
         return self.action_of(left=target) if point[1] > 0 else self.action_of(right=target)

@@ -70,7 +70,7 @@ class Task(BaseTask):
     @classmethod
     def constant_actions(cls) -> list[tuple[float, ...]]:
         """The poses of `constant_poses`, which are left-right symmetric."""
-        return [
+        return [  # 0.0 - x, because -x of 0.0 is -0.0
             (forward, outward, up, forward, 0.0 - outward, up, height)
             for forward, outward, up, height in itertools.product(*cls.constant_poses)
         ]
@@ -87,15 +87,15 @@ class Task(BaseTask):
         """Ids of the geoms of `add_objects`."""
         return tuple(self.robot.index.objects[self.name])
 
-    def to_body(self, vector_w: Array) -> Array:
+    def to_heading_frame(self, vector_w: Array) -> Array:
         """(3,) world vector in the axes of the pelvis heading frame."""
-        turned: Array = np.einsum("i,ij->j", vector_w, self.robot.heading)
-        return turned
+        vector: Array = np.einsum("i,ij->j", vector_w, self.robot.heading)
+        return vector
 
     @property
     def object_b(self) -> Array:
         """(3,) position of the object, m, pelvis heading frame."""
-        return self.to_body(self.state().position_w - self.robot.data.qpos[:3])
+        return self.to_heading_frame(self.state().position_w - self.robot.data.qpos[:3])
 
     @staticmethod
     def action_of(
@@ -130,6 +130,6 @@ class Task(BaseTask):
         self.process_contacts(contacts)
 
     def has_fallen(self) -> bool:
-        """Whether the robot lies, or is too low or too tilted to recover."""
+        """Whether the robot has fallen, or is too low or too tilted to recover."""
         robot = self.robot
         return robot.pelvis_height < FALL_HEIGHT or robot.tilt > FALL_TILT or robot.on_floor

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from egovcp.sim.scenario import Scenario
 
 WALL: Final = "wall"
-_HALF_SIZE: Final = (0.05, 1.5, 1.3)  # m: thickness, width, height
+_HALF_SIZE: Final = (0.05, 1.5, 1.3)  # m: half the thickness, width and height
 # The oracle.
 _PRESS: Final = 0.05  # m, hand targets behind the wall's surface
 _PRESS_ASIDE: Final = 0.20  # m, left and right
@@ -34,7 +34,7 @@ class WallConfig(TaskConfig):
     """A wall before the robot, which is pushed towards it; only hands may touch."""
 
     distance_range: Range = bounded((0.60, 0.70), least=0.3, most=10)
-    """Wall surface before the pelvis, m."""
+    """Distance from pelvis to wall surface, m."""
     yaw_range: Range = bounded((-0.10, 0.10), least=-1, most=1)
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
     friction_range: Range = bounded((0.6, 1.0), least=0, most=5)
@@ -51,7 +51,7 @@ class WallConfig(TaskConfig):
     push_time: float = bounded(0.02, least=0.005, most=1)
     """Time over which a push acts, s."""
     disturbed_time: float = bounded(1.0, least=0, most=3600)
-    """Time after a push in which the scripted oracle presses its hands on the wall, s."""
+    """Time after a push during which the wall task is active, s."""
     hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, when anything but a hand touches the wall."""
 
@@ -100,20 +100,22 @@ class WallTask(Task):
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         self._surface = pelvis + heading @ np.array([self.parameters["distance"], 0.0, 0.0])
         self._surface[2] = 0.0
-        turn = math.atan2(heading[1, 0], heading[0, 0]) + self.parameters["yaw"]
-        data, quaternion = self.robot.data, (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+        wall_yaw = math.atan2(heading[1, 0], heading[0, 0]) + self.parameters["yaw"]
+        data = self.robot.data
+        quaternion = (math.cos(wall_yaw / 2), 0.0, 0.0, math.sin(wall_yaw / 2))
         data.mocap_pos[self._mocap], data.mocap_quat[self._mocap] = self._surface, quaternion
-        self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
+        self._normal = np.array([math.cos(wall_yaw), math.sin(wall_yaw), 0.0])
 
     def park(self) -> None:
         self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
     def before_step(self) -> None:
-        """Push: the base gains ``push_speed`` in equal parts over ``push_time``."""
+        """Push: the base gains ``push_speed`` in equal parts over ``push_time``, in whole steps."""
         # half a step of slack keeps rounding from adding or losing one part
         since = self.since_event + PHYSICS_DT / 2
-        if 0.0 <= since < self.config.push_time:
-            part = self.push_speed * PHYSICS_DT / self.config.push_time
+        duration = max(1, round(self.config.push_time / PHYSICS_DT)) * PHYSICS_DT
+        if 0.0 <= since < duration:
+            part = self.push_speed * PHYSICS_DT / duration
             direction = np.array([math.cos(self._bearing), math.sin(self._bearing), 0.0])
             self.robot.data.qvel[:3] += part * (self.robot.heading @ direction)
 

@@ -76,7 +76,7 @@ class PlanarArm(MujocoRobot):
         return position
 
     def state(self) -> Array:
-        """(12,) proprioception; the encoders have noise."""
+        """(12,) proprioception; the measured positions have noise."""
         angles = self.data.qpos[:3] + self.rng.normal(0.0, ENCODER_RAD, 3)
         heading = np.cumsum(angles)
         x, y = float(np.cos(heading) @ LENGTHS), float(np.sin(heading) @ LENGTHS)
@@ -86,12 +86,13 @@ class PlanarArm(MujocoRobot):
         """(32, 32) planar depth, mm, with noise."""
         exact = super().depth()
         noise = self.rng.normal(0.0, 1000.0 * NOISE_M, exact.shape)
-        return np.where(exact > 0, np.clip(exact + noise, 1, 750), 0).round().astype(np.uint16)
+        noisy = np.clip(exact + noise, 1, 1000 * self.spec.depth_max_m)
+        return np.where(exact > 0, noisy, 0).round().astype(np.uint16)
 
 
-def reach_of(x: float, y: float) -> Array:
+def inverse_kinematics(x: float, y: float) -> Array:
     """(3,) joint angles, rad, that bring the tip to (x, y): the last two links bend alike."""
-    best, least = np.zeros(3), math.inf
+    best, least_error = np.zeros(3), math.inf
     for bend in np.linspace(-1.7, 1.7, 341):  # one degree of freedom is left: elbow = wrist
         angles = np.array([0.0, bend, bend])
         heading = np.cumsum(angles)
@@ -99,6 +100,6 @@ def reach_of(x: float, y: float) -> Array:
         angles[0] = math.atan2(y, x) - math.atan2(py, px)
         angles[0] = (angles[0] + math.pi) % (2 * math.pi) - math.pi
         error = abs(math.hypot(px, py) - math.hypot(x, y)) + max(0.0, abs(angles[0]) - LIMIT[0])
-        if error < least:
-            best, least = angles, error
+        if error < least_error:
+            best, least_error = angles, error
     return best

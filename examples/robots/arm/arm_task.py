@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from arm_robot import HEIGHT, PlanarArm, reach_of
+from arm_robot import HEIGHT, PlanarArm, inverse_kinematics
 
 from egovcp.sim.tasks import (
     Array,
@@ -76,7 +76,7 @@ class ReachTask(RobotTask):
         if self.since_event >= 0 and not self._shown:
             self._shown = True
             self.robot.data.mocap_pos[0] = self._goal
-            self._angles = reach_of(*self._goal[:2])
+            self._angles = inverse_kinematics(*self._goal[:2])
 
     @property
     def _distance(self) -> float:

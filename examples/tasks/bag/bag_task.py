@@ -138,5 +138,5 @@ class BagTask(Task):
         if not 0.0 <= self.since_event < 2.0:
             return np.zeros(7)
         reach = 0.22 * self._from + [0.0, 0.0, 0.05]
-        x, y, z = self.to_body(self._aim + reach - self.robot.data.qpos[:3])
+        x, y, z = self.to_heading_frame(self._aim + reach - self.robot.data.qpos[:3])
         return self.action_of(left=(x, y + 0.07, z), right=(x, y - 0.07, z))

@@ -125,4 +125,5 @@ class TableTask(Task):
             return np.zeros(7)
         aside = np.array([-self._away[1], self._away[0], 0.0])
         place = self._edge + 0.12 * self._away - self.robot.data.qpos[:3] - [0.0, 0.0, 0.06]
-        return self.action_of(self.to_body(place + 0.2 * aside), self.to_body(place - 0.2 * aside))
+        left, right = place + 0.2 * aside, place - 0.2 * aside
+        return self.action_of(self.to_heading_frame(left), self.to_heading_frame(right))

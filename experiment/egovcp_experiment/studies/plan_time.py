@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.bounds import bounded
+from egovcp.errors import EnvironmentFailure
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.plan.config import OptimiserName
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM
@@ -87,9 +88,18 @@ def _median_times[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float
 def _affordable(
     planner: PlannerConfig, search: str, few_ms: float, many_ms: float, budget_ms: float
 ) -> dict[str, Any]:
-    """Options of the search with the most candidates in the budget, `_MULTIPLE` to `_MOST`."""
+    """Options of the search with the most candidates in the budget, `_MULTIPLE` to `_MOST`.
+
+    Raises:
+        EnvironmentFailure: plans with more candidates took less time.
+    """
     optimiser, iterations = SEARCHES[search]
-    slope = max((many_ms - few_ms) / (_MANY - _FEW), 1e-9)
+    if many_ms <= few_ms:
+        raise EnvironmentFailure(
+            f"timing too noisy: plans of {search} took {few_ms:.2f} ms with {_FEW} candidates and "
+            f"{many_ms:.2f} ms with {_MANY}; stop other programs, or increase --rounds"
+        )
+    slope = (many_ms - few_ms) / (_MANY - _FEW)
     room = _FEW + (budget_ms - few_ms) / slope
     samples = min(max(_MULTIPLE, int(room // _MULTIPLE) * _MULTIPLE), _MOST)
     return {
@@ -98,6 +108,7 @@ def _affordable(
         "samples": samples,
         "elites": min(planner.elites, samples // 2),  # docs/planner.md
         "plan_ms": few_ms + slope * (samples - _FEW),
+        "within_budget": room >= _MULTIPLE,
         "measured_ms": {str(_FEW): few_ms, str(_MANY): many_ms},
     }
 

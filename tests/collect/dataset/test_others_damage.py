@@ -10,6 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from egovcp.data.lerobot import LeRobotReader
+from egovcp.errors import DataError
 from egovcp_collect.dataset.cli import main
 from tests.support.lerobot_datasets import KINDS
 
@@ -85,6 +87,9 @@ DAMAGE: dict[str, tuple[str, d.Damage, str, int | None, str]] = {
         "arm", rows_of(d.DATA, episode_index=lambda v: v.__setitem__(slice(8, 20), [0] * 12)),
         d.DATA, 0, "of another episode",
     ),
+    "null episode number": (
+        "arm", rows_of(d.DATA, episode_index=item(9, None)), d.DATA, 1, "has a null value",
+    ),
     "time goes back": (
         "arm", rows_of(d.DATA, timestamp=item(12, 0.1)), d.DATA, 1, "timestamps must increase",
     ),
@@ -149,6 +154,26 @@ def test_damage_is_named(
     matching = [p for p in problems if (p["file"], p["episode"]) == (file, episode)]
     assert any(text in problem["problem"] for problem in matching), problems
     assert text in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_an_episode_is_read_beside_a_damaged_one(
+    statistics: bool, others: dict[str, Path], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    path, table = root / d.DATA, pq.read_table(root / d.DATA)
+    with pq.ParquetWriter(path, table.schema, write_statistics=statistics) as writer:
+        for first, length in ((0, 30), (30, 40), (70, 2)):
+            writer.write_table(table.slice(first, length))
+    column = pq.read_metadata(path).row_group(1).column(0)
+    content = bytearray(path.read_bytes())
+    start = column.dictionary_page_offset or column.data_page_offset
+    content[start : start + 8] = b"\xff" * 8
+    path.write_bytes(content)
+    reader = LeRobotReader.open(root)
+    assert reader.read(reader.rows[2], ["action"]).num_rows == 2
+    with pytest.raises(DataError, match="episode 1: damaged"):
+        reader.read(reader.rows[1], ["action"])
 
 
 @pytest.mark.parametrize("kind", KINDS)

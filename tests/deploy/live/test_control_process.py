@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +35,8 @@ from egovcp_deploy.live.planner_loop import PlannerLoop
 from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
-from egovcp_deploy.pilot.states import Limits, OperatorCommand, State
+from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
+from egovcp_deploy.robots.bridge import BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
@@ -111,6 +115,91 @@ def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
             sink.close()
 
 
+@pytest.mark.parametrize(
+    ("requests", "expected"),
+    [
+        ("arm run", "run"),
+        ("hold run", "hold"),
+        ("run hold", "hold"),
+        ("estop hold run", "estop"),
+        ("hold estop", "estop"),
+        ("", None),
+    ],
+)
+def test_a_stop_precedes_a_hold_which_precedes_other_requests(
+    requests: str, expected: str | None
+) -> None:
+    commands = [OperatorCommand(OperatorRequest(request)) for request in requests.split()]
+    velocities = [(0.1, 0.0, 0.0), (0.2, 0.0, 0.0)]
+    commands += [OperatorCommand(velocity=velocity) for velocity in velocities]
+    assert merged(commands) == OperatorCommand(expected, velocities[-1])
+
+
+def test_a_blocked_terminal_does_not_stop_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(1 << 16))
+    os.set_blocking(writer, True)
+    hardware = SimpleNamespace(body=SimpleNamespace(read=lambda: None), camera=None, link=None)
+    setup = ControlSetup(BridgeConfig(), CameraOptions(), "stance", Limits(), parent=0)  # has ended
+    ticks, stopping, enough = list[int](), list[int](), threading.Event()
+
+    def tick(now_ns: int, command: OperatorCommand) -> None:
+        ticks.append(now_ns)
+        if len(ticks) > 5:
+            enough.set()
+
+    pilot = SimpleNamespace(add_events=lambda events: None)
+    with open(writer, "w") as full, closing(Link(f"ipc://{tmp_path}/link", serve=True)) as link:
+        control = ControlProcess(setup, hardware, link)
+        control._loop = SimpleNamespace(state=State.RUN, tick=tick, pilot=pilot)
+        monkeypatch.setattr(sys, "stderr", full)
+        thread = threading.Thread(target=control.run, args=(stopping,))
+        thread.start()
+        try:
+            assert enough.wait(30.0)
+        finally:
+            os.close(reader)  # ends a blocked write
+            stopping.append(signal.SIGTERM)
+            thread.join()
+
+
+#: `control_process` without a robot; its loop sends a signal to itself.
+_STUBBED = """
+import os, sys, time
+from types import SimpleNamespace as Stub
+from egovcp_deploy.live import control_process as c
+hardware = Stub(body=None, close=lambda: None)
+def run(stopping):
+    os.kill(os.getpid(), int(sys.argv[1]))
+    while not stopping:
+        time.sleep(0.01)
+c.open_hardware = lambda bridge, camera: hardware
+c.Link = lambda address, serve: Stub(close=lambda: None)
+c.raise_priority = lambda level: False
+c.ControlProcess = lambda setup, hardware, link: Stub(run=run, warn=lambda line: print(line))
+c.damp_motors = lambda body: print("damped")
+c.control_process(Stub(bridge=None, camera=None, address=""))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_a_signal_damps_the_motors(number: signal.Signals) -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", _STUBBED, str(int(number))],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    warning, end = result.stdout.splitlines()
+    assert "no real-time priority" in warning
+    assert end == "damped"
+
+
 class Crouching(Reaching):
     """Wants the pelvis as low as it goes."""
 
@@ -127,7 +216,7 @@ class Crouching(Reaching):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["stance", "walk"])
-@pytest.mark.parametrize("pause", [0.0, 2.0])
+@pytest.mark.parametrize("pause", [1.5, 2.0])
 def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -> None:
     quiet = EpisodeConfig(ticks=50, event_ticks=(5, 5), empty_probability=1.0)
     robot = LiveRobot(EnvConfig(controller=name, ball_episode=quiet))

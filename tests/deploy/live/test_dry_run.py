@@ -152,6 +152,15 @@ def test_a_healthy_robot_is_go_in_every_line(look: Look) -> None:
     assert "when they arrive" in lines["image age"]
 
 
+def test_a_missing_real_time_priority_is_a_warning(
+    look: Look, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egovcp_deploy.dry_run.raise_priority", lambda level: False)
+    _, lines = look(lambda fake: None)
+    assert lines["priority"].startswith("warn")
+    assert "'USER - rtprio 20'" in lines["priority"]
+
+
 def test_it_needs_no_output_dir_and_writes_nothing(look: Look, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
     code, lines = look(lambda fake: None)

@@ -97,15 +97,16 @@ def test_info_reports_missing_ticks(
     assert report["rate_hz"] == pytest.approx(6 / 0.32)
 
 
-def test_info_of_a_torn_file_names_the_recovery(
+def test_info_of_a_truncated_file_names_the_recovery(
     record: Record, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = record()
-    file.write_bytes(file.read_bytes()[:-20])
+    whole = record()
+    file = whole.with_name("my run.mcap")
+    file.write_bytes(whole.read_bytes()[:-20])
     assert main(["info", str(file)]) == 0
     out = capsys.readouterr().out
-    assert "TORN" in out
-    assert f"egovcp-mcap recover {file}" in out
+    assert "TRUNCATED" in out
+    assert f"egovcp-mcap recover '{file}'" in out
 
 
 def test_the_duration_counts_periods(record: Record) -> None:

@@ -6,7 +6,9 @@ import math
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.geometry import pixel_rays
 from egovcp.sim.config import CameraConfig
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS
+from egovcp_deploy.robots import depth_server
 from egovcp_deploy.robots.base import DepthImage
 from egovcp_deploy.robots.depth_server import DepthServer
 from egovcp_deploy.robots.depth_server import main as serve_depth
@@ -33,6 +36,7 @@ from egovcp_deploy.robots.zmq_camera import (
     decode_frame,
     encode_frame,
 )
+from tests.support.lockstep import LockstepClock
 from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, eventually
 
 FOV = CameraConfig.vertical_fov
@@ -277,6 +281,24 @@ def test_depth_server_publishes_each_image_once() -> None:
         DepthServer(shown, FOV, "127.0.0.1", server.port)
     camera.close()
     server.close()
+
+
+def test_depth_server_warns_of_a_silent_camera_and_then_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock, shown = LockstepClock(), ShownImage()
+    monkeypatch.setattr(depth_server, "time", SimpleNamespace(monotonic_ns=clock.now_ns))
+    with closing(DepthServer(shown, FOV, "127.0.0.1", 0)) as server:
+        clock.advance(900_000_000)
+        shown.image = DepthImage(0, noise(0))
+        server.step()
+        for _ in range(49):
+            clock.advance(100_000_000)
+            server.step()
+        assert capsys.readouterr().err.count("no new image of the camera") == 4
+        clock.advance(100_000_000)
+        with pytest.raises(EnvironmentFailure, match="no new image of the camera for 5 s"):
+            server.step()
 
 
 def test_depth_server_reports_a_missing_serial_number(capsys: pytest.CaptureFixture[str]) -> None:

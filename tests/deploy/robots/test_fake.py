@@ -79,7 +79,7 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
     scenarios = [Scenario("ball", 1, 0), Scenario("wall", 1, 1)]
     episodes = EpisodeSequencer(
         driver.fake,
-        FakeG1Config(gantry=0.5, settle=0.5, pause=0.1),
+        FakeG1Config(gantry=0.5, settle=0.5, pause=1.5),
         iter(scenarios),
         log.append,
     )
@@ -242,7 +242,12 @@ def test_console_commands_set_and_clear_faults() -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["frieze_state", "drop", "drop much", "push hard", "push 1", "drop nan", "mode 300"]
+    "line",
+    [
+        *("frieze_state", "drop", "drop much", "push hard", "push 1", "drop nan", "mode 300"),
+        *("freeze_camera of", "clear all", "release now", "dropped_motor left_knee 3"),
+        *("hot_motor left_knee 110 120", "hot_motor left_knee nan", "push nan 0", "push inf 0"),
+    ],
 )
 def test_unknown_console_commands_are_refused(line: str) -> None:
     faults = InjectedFaults()

@@ -18,7 +18,7 @@ STANCE = "--env.controller=stance"
 
 def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> None:
     out = tmp_path / "outcomes.json"
-    flags = ("--episodes=1", "--settle=0", "--pause=0", f"--json={out}")
+    flags = ("--episodes=1", "--settle=0", "--pause=1.5", f"--json={out}")
     with fake_g1_process(STANCE, *flags) as fake:
         assert fake.ports.host == "127.0.0.1"
         robot = BridgeRobot(bridge_config(fake))
@@ -43,6 +43,12 @@ def test_it_ends_on_a_console_command(word: str, code: int) -> None:
     assert fake.program.returncode == code
 
 
+def test_the_report_is_written_on_quit(tmp_path: Path) -> None:
+    with fake_g1_process(STANCE, f"--json={tmp_path / 'outcomes.json'}") as fake:
+        fake.program.communicate("quit\n", timeout=60)
+    assert json.loads((tmp_path / "outcomes.json").read_text()) == []
+
+
 def test_it_ends_on_an_interrupt() -> None:
     with fake_g1_process(STANCE) as fake:
         fake.program.send_signal(signal.SIGINT)
@@ -55,6 +61,7 @@ def test_it_ends_on_an_interrupt() -> None:
     [
         ("--task=bal", 2, "did you mean 'ball'"),
         ("--episode=-1", 2, "--episode=-1: expected at least 0"),
+        ("--pause=1", 2, "--pause=1: expected at least 1.5"),
         ("--json=/dev/null/all.json", 2, "/dev/null is not a folder"),
     ],
 )

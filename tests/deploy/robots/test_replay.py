@@ -142,15 +142,42 @@ def test_a_live_run_begins_with_the_first_tick_in_run(
     standing = [replace(t, index=i, mode="stand") for i, t in enumerate(ticks)]
     running = [replace(t, index=TICKS + i) for i, t in enumerate(ticks)]
     assert running[0].mode == "run"
-    sink = McapSink(tmp_path / "live.mcap")
-    sink.open(RunInfo("ball"))
-    for tick in (*standing, *running):
-        sink.write(tick)
-    sink.close()
+    write(tmp_path / "live.mcap", RunInfo("ball"), [*standing, *running])
     robot = open_recordings(tmp_path / "live.mcap")
     np.testing.assert_array_equal(robot.observe().state, ticks[0].state)
     ended = [robot.act(np.zeros(7)).truncated for _ in range(TICKS)]
     assert ended == [False] * (TICKS - 1) + [True]
+
+
+def write(path: Path, info: RunInfo, ticks: list[Tick]) -> None:
+    sink = McapSink(path)
+    sink.open(info)
+    for tick in ticks:
+        sink.write(tick)
+    sink.close()
+
+
+def test_missing_ticks_are_reported(
+    recorded: tuple[Path, list[Watched]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read_recording(recorded[0] / "rollout-0.mcap")
+    open_recordings(recorded[0] / "rollout-0.mcap")
+    assert capsys.readouterr().err == ""
+    write(tmp_path / "gap.mcap", recording.info, [*recording.ticks[:3], *recording.ticks[5:]])
+    open_recordings(tmp_path / "gap.mcap")
+    assert "gap.mcap: 2 ticks are missing" in capsys.readouterr().err
+
+
+def test_recordings_of_different_controllers_are_refused(
+    recorded: tuple[Path, list[Watched]], tmp_path: Path
+) -> None:
+    recording = read_recording(recorded[0] / "rollout-0.mcap")
+    other = replace(recording.info, hashes={"low_level_controller": "another"})
+    write(tmp_path / "rollout-0.mcap", recording.info, recording.ticks)
+    write(tmp_path / "rollout-1.mcap", other, recording.ticks)
+    robot = open_recordings(tmp_path)
+    with pytest.raises(DataError, match=r"rollout-1\.mcap.*'another', expected"):
+        robot.start(1)
 
 
 def test_a_torn_recording_ends_truncated(

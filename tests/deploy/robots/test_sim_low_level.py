@@ -22,7 +22,7 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     robot = SimLowLevelRobot(live)
     episodes = EpisodeSequencer(
         robot,
-        FakeG1Config(gantry=0.3, settle=0.3, pause=0.0),
+        FakeG1Config(gantry=0.3, settle=0.3, pause=1.5),
         iter([Scenario("ball", 4, 0)]),
     )
     clock = SimClock(episodes.step)

@@ -15,7 +15,7 @@ from egovcp.data import (
     DatasetWriter,
     Episode,
     Provenance,
-    files,
+    dataset_files,
 )
 from egovcp.testing import random_episode
 
@@ -75,10 +75,12 @@ class Disk:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(name))
 
     def install(self, monkeypatch: pytest.MonkeyPatch) -> "Disk":
-        """Put the disk between `egovcp.data.files` and the real one."""
-        monkeypatch.setattr(files, "create", lambda path: io.BufferedWriter(_File(self, path)))
+        """Put the disk between `egovcp.data.dataset_files` and the real one."""
+        monkeypatch.setattr(
+            dataset_files, "open_new", lambda path: io.BufferedWriter(_File(self, path))
+        )
         for name in ("sync", "rename", "link", "exchange"):
-            monkeypatch.setattr(files, name, self._counted(getattr(files, name)))
+            monkeypatch.setattr(dataset_files, name, self._counted(getattr(dataset_files, name)))
         return self
 
     def _counted(self, function: Any) -> Any:

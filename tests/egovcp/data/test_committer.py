@@ -13,7 +13,14 @@ from typing import Any
 import pytest
 
 from egovcp.checks.dataset import dataset_problems
-from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance, files
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    Provenance,
+    dataset_files,
+)
 from egovcp.data.committer import Committer, open_committer, work_folder
 from egovcp.data.metadata import verify_hashes
 from egovcp.data.staging import StagedEpisode, encode
@@ -191,7 +198,7 @@ def test_publish_without_exchange_uses_three_renames(
     def unsupported(one: Path, other: Path) -> None:
         raise OSError(errno.EINVAL, "not here")
 
-    monkeypatch.setattr(files, "exchange", unsupported)
+    monkeypatch.setattr(dataset_files, "exchange", unsupported)
     root = tmp_path / "d"
     _commit_all(root, episodes, [3, 3])
     assert _tree(root) == whole[6]
@@ -217,7 +224,7 @@ def test_a_crash_between_the_renames_is_recovered(
 
 
 def _crash_in_swap(patch: pytest.MonkeyPatch, after: int) -> None:
-    rename, done = files.rename, 0
+    rename, done = dataset_files.rename, 0
 
     def unsupported(one: Path, other: Path) -> None:
         raise OSError(errno.ENOSYS, "not here")
@@ -229,8 +236,8 @@ def _crash_in_swap(patch: pytest.MonkeyPatch, after: int) -> None:
         if done == after:
             raise KeyboardInterrupt
 
-    patch.setattr(files, "exchange", unsupported)
-    patch.setattr(files, "rename", crashing)
+    patch.setattr(dataset_files, "exchange", unsupported)
+    patch.setattr(dataset_files, "rename", crashing)
 
 
 def test_files_without_hard_links_are_copied(

@@ -17,7 +17,7 @@ from egovcp.data import (
     DatasetWriter,
     Episode,
     Provenance,
-    files,
+    dataset_files,
 )
 from egovcp.data.committer import open_committer, work_folder
 from egovcp.data.staging import StagedEpisode, encode
@@ -132,7 +132,7 @@ def test_files_of_another_program_are_not_replaced(
     write: Callable[[Path, list[Episode]], None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    root, rename = tmp_path / "d", files.rename
+    root, rename = tmp_path / "d", dataset_files.rename
 
     def write_first(source: Path, target: Path) -> None:
         if target == root:
@@ -140,7 +140,7 @@ def test_files_of_another_program_are_not_replaced(
             (root / "notes.txt").write_text("mine")
         rename(source, target)
 
-    monkeypatch.setattr(files, "rename", write_first)
+    monkeypatch.setattr(dataset_files, "rename", write_first)
     with pytest.raises(UsageError, match="no longer empty"):
         write(root, episodes[:1])
     assert [path.name for path in root.iterdir()] == ["notes.txt"]
@@ -227,7 +227,7 @@ def test_a_root_that_cannot_be_renamed_loses_nothing(
     root = tmp_path / "d"
     _collect(root, episodes[:1])
     with monkeypatch.context() as patch:
-        patch.setattr(files, "exchange", busy)
+        patch.setattr(dataset_files, "exchange", busy)
         with pytest.raises(EnvironmentFailure, match=f"{root} cannot be renamed"):
             _collect(root, episodes[:2], resume=True)
     assert _size(root) == 1
@@ -235,6 +235,15 @@ def test_a_root_that_cannot_be_renamed_loses_nothing(
         assert committer.missing(2) == []  # what was simulated is still sealed
         committer.commit()
     assert _size(root) == 2
+
+
+def test_exchange_without_renameat2_is_not_supported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ctypes.CDLL", lambda *args, **options: object())
+    with pytest.raises(OSError, match="needs renameat2") as caught:
+        dataset_files.exchange(tmp_path / "a", tmp_path / "b")
+    assert caught.value.errno == errno.ENOSYS
 
 
 def test_hard_links_across_file_systems_become_copies(
@@ -245,5 +254,5 @@ def test_hard_links_across_file_systems_become_copies(
 
     (tmp_path / "a").write_text("content")
     monkeypatch.setattr(os, "link", other_device)
-    files.link(tmp_path / "a", tmp_path / "b")
+    dataset_files.link(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "b").read_text() == "content"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.cli import SelectedDatasetConfig
 from egovcp.data import DatasetReader, EpisodeIndex, describe_heldout
 from egovcp.data import index as index_module
+from egovcp.dataset_options import SelectedDatasetConfig
 
 
 def test_the_held_out_episodes_are_named(

@@ -142,9 +142,10 @@ def test_a_malformed_selection_is_refused(text: str) -> None:
         select_episodes(text, 10)
 
 
-def test_an_empty_range_is_refused() -> None:
+@pytest.mark.parametrize("text", ["5:5", "[5:3, 7]", "10:"])
+def test_an_empty_range_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="selects no episode; there are 10"):
-        select_episodes("5:5", 10)
+        select_episodes(text, 10)
 
 
 def test_a_number_that_may_be_a_yaml_range_is_refused() -> None:

@@ -233,9 +233,7 @@ def test_the_kernel_agrees_across_vector_widths(
 
 
 @needs_compiler
-@pytest.mark.skipif(
-    not library.processor_has("amx_int8") or library.tiles_are_refused(), reason="no AMX"
-)
+@pytest.mark.skipif(not library.request_amx_tiles(), reason="no AMX")
 @pytest.mark.parametrize("change", MODELS)
 def test_kernel_without_tiles_is_bit_identical(
     change: dict[str, object], monkeypatch: pytest.MonkeyPatch
@@ -243,7 +241,7 @@ def test_kernel_without_tiles_is_bit_identical(
     model, config = _model(**change), PlannerConfig(backend="int8")
     carry, actions = _carry(model), _actions()
     tiles = _values(model, config, carry, actions)
-    monkeypatch.setattr(library, "tiles_are_refused", lambda: True)
+    monkeypatch.setattr(library, "request_amx_tiles", lambda: False)
     library.library.cache_clear()
     try:
         vectors = _values(model, config, carry, actions)

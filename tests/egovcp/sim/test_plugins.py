@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,12 @@ import egovcp.sim.tasks.registry as registry
 from egovcp.checks import ConformanceError, check_task
 from egovcp.entry_point import EntryPoint
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.robot_spec import G1, RobotSpec
+from egovcp.sim import robot_env
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks import find_task, register_task, task_entries, task_names
+from egovcp.sim.tasks import Task, find_task, register_task, task_entries, task_names
 from tests.support.plugins import install
 
 #: A post that is always there; ``{}`` is replaced by the part of a test.
@@ -285,3 +287,14 @@ class Nobody(Reach):
         register_task("robot_tasks:Reach")
     with pytest.raises(UsageError, match="lacks robot_class;"):
         register_task("robot_tasks:Nobody")
+
+
+def test_a_task_of_another_robot_must_be_a_robot_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    class ArmTask(Task):
+        @classmethod
+        def robot_spec(cls) -> RobotSpec:
+            return replace(G1, robot_type="arm")
+
+    monkeypatch.setattr(robot_env, "find_task", lambda task: ArmTask)
+    with pytest.raises(UsageError, match="ArmTask is of robot arm, but not a subclass"):
+        robot_env.robot_class("arm")

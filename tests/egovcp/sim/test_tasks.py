@@ -173,6 +173,20 @@ def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
     assert np.all((fastest > 0.2) & (fastest < 0.6))
 
 
+@pytest.mark.parametrize("push_time", [0.007, 0.013, 0.02])
+def test_the_parts_of_a_push_add_up_to_its_speed(config: EnvConfig, push_time: float) -> None:
+    push = WallConfig(push_speed_range=(0.4, 0.4), away_probability=0.0, push_time=push_time)
+    env = VectorEnv(replace(config, wall=push), 1)
+    begin(env, "wall")
+    task = env.instances[0].task
+    velocity = task.robot.data.qvel[:3]
+    velocity[:] = 0.0
+    while task.since_event < 0.1:
+        task.before_step()
+        task.physics_steps += 1
+    assert np.linalg.norm(velocity) == pytest.approx(0.4)
+
+
 def test_an_unbraced_push_ends_at_the_wall_and_costs_once(config: EnvConfig) -> None:
     push = WallConfig(push_speed_range=(1.0, 1.0), away_probability=0.0)
     env = VectorEnv(replace(config, wall=push), 4)

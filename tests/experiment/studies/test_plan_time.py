@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from egovcp.errors import EnvironmentFailure
 from egovcp.plan import PlannerConfig
 from egovcp_experiment.cell import read_json
 from egovcp_experiment.studies import plan_time
@@ -27,12 +28,18 @@ def test_candidates_follow_from_two_times(
     assert found["samples"] == samples
     assert found["elites"] == 4  # the planner's number
     assert found["plan_ms"] == pytest.approx(2 + samples / 32)
+    assert found["within_budget"] == (budget > 3)
+
+
+def test_times_that_do_not_grow_are_refused() -> None:
+    with pytest.raises(EnvironmentFailure, match="timing too noisy"):
+        plan_time._affordable(PlannerConfig(), "cem", 10.0, 10.0, 40.0)
 
 
 def test_every_search_is_timed_and_can_be_played(flags: list[str], tmp_path: Path) -> None:
     only = [f for f in flags if f.startswith(("--policy", "--output"))]
     planner = ["--planner.samples=256", "--planner.elites=20"]
-    assert plan_time.main([*only, *planner, "--rounds=1", "--budget_ms=20"]) == 0
+    assert plan_time.main([*only, *planner, "--rounds=5", "--budget_ms=20"]) == 0
     found = read_json(tmp_path / "out" / "result.json")["searches"]
     assert set(found) == set(plan_time.SEARCHES)
     for row in found.values():

@@ -30,7 +30,7 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.live.control_process import RECEIVING, control_process
+from egovcp_deploy.live.control_process import RECEIVER_PRIORITY, control_process
 from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
 from egovcp_deploy.live.link import Link, decode_observation, encode_operator_command, encode_plan
 from egovcp_deploy.live.processes import DampingWatchdog, standby_body
@@ -136,7 +136,7 @@ class FaultRig:
         self._robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
         self._robot.start(Scenario("ball", 0, 0))
         free = Ports(command_port=0, state_port=0, camera_port=0)
-        with raised_priority(RECEIVING):  # a real robot has its own computers
+        with raised_priority(RECEIVER_PRIORITY):  # a real robot has its own computers
             self.fake = FakeBridge(self._robot, free, detailed=True)
             self.proxy = StreamProxy(self.fake.ports.state_port)
         self.fake.on_command = self._record
@@ -151,7 +151,7 @@ class FaultRig:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._simulate, daemon=True)
         gc.freeze()  # a long collection would stop the robot
-        with raised_priority(RECEIVING):
+        with raised_priority(RECEIVER_PRIORITY):
             self._thread.start()
 
     # --- the robot's thread --------------------------------------------------------------
@@ -240,7 +240,7 @@ class FaultRig:
         bridge = BridgeConfig(state_port=self.proxy.port, command_port=ports.command_port)
         camera = CameraOptions(server=ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov))
         address = f"ipc://{stack.enter_context(tempfile.TemporaryDirectory())}/link"
-        with raised_priority(RECEIVING):
+        with raised_priority(RECEIVER_PRIORITY):
             link = Link(address, serve=True)
         stack.callback(link.close)
         self._outbox.clear()
@@ -250,14 +250,14 @@ class FaultRig:
         self.process: BaseProcess = _FORKSERVER.Process(
             target=_run_control_process, args=(setup,), daemon=True
         )
-        with raised_priority(RECEIVING):  # inherited by the fork server
+        with raised_priority(RECEIVER_PRIORITY):  # inherited by the fork server
             self.process.start()
         stack.callback(self._end_process)
         guard = DampingWatchdog(self.process, spare, lambda: self._ending)
         stack.callback(guard.join_if_ended)
         ending = threading.Event()
         planner = threading.Thread(target=self._plan, args=(link, ending), daemon=True)
-        with raised_priority(RECEIVING):
+        with raised_priority(RECEIVER_PRIORITY):
             planner.start()
         stack.callback(planner.join)
         stack.callback(ending.set)

@@ -3,6 +3,7 @@
 import json
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,10 @@ import pytest
 from PIL import Image
 
 from egovcp.artifact import load_artifact, save_artifact
-from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader
+from egovcp.dataset_options import DatasetConfig
 from egovcp.plan import PlannerConfig
+from egovcp.robot_spec import G1
 from egovcp.testing import toy_model
 from egovcp_train.heldout import command, report
 from egovcp_train.heldout.command import main
@@ -146,3 +148,28 @@ def test_data_of_another_controller_is_refused(
     said = capsys.readouterr().err
     assert "walk-of-others" in said
     assert DatasetReader.open(DatasetConfig(root=str(dataset_root))).controller_id in said
+
+
+def test_data_of_another_robot_is_refused(
+    dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Converted datasets of different robots may have the same controller id, ``unknown``."""
+    controller_id = DatasetReader.open(DatasetConfig(root=str(dataset_root))).controller_id
+    model = toy_model(robot=replace(G1, robot_type="arm"))
+    save_artifact(tmp_path / "p", model, PlannerConfig(), {"controller_id": controller_id})
+    assert main(_argv(tmp_path / "p", dataset_root, tmp_path / "out")) == 2
+    assert "on data of robot arm, " in capsys.readouterr().err
+
+
+def test_results_are_never_overwritten(
+    policy: Path, dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "heldout.json").write_text("{}")
+    assert main(_argv(policy, dataset_root, tmp_path)) == 2
+    assert "exists and is not empty; choose another" in capsys.readouterr().err
+    assert (tmp_path / "heldout.json").read_text() == "{}"
+
+
+def test_numbers_that_are_not_finite_are_null(tmp_path: Path) -> None:
+    command._write(tmp_path, report.HeldoutReport({"value/r2": float("nan")}, {}, {}, {}), {})
+    assert json.loads((tmp_path / "heldout.json").read_text())["all_tasks"] == {"value/r2": None}

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import evenly_spaced
+from egovcp.dataset_options import DatasetConfig
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
 from egovcp.model.losses import filter_sequence
 from egovcp.model.privileged_value import PrivilegedValue

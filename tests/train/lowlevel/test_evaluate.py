@@ -118,7 +118,7 @@ def test_the_rms_torque_counts_only_the_ticks_before_a_fall():
 
 
 def test_a_push_along_the_heading_goes_forwards_or_backwards():
-    skill = Skill("trial", "", 1.0, skills.neutral, push=1.0, push_any=False)
+    skill = Skill("trial", "", 1.0, skills.neutral, push=1.0, push_any_direction=False)
     assert set(_directions(skill, 32, _rng())) == {0.0, np.pi}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,14 +13,17 @@ import torch
 
 from egovcp.artifact import Artifact, load_artifact, returns_of
 from egovcp.bounds import MAX_PER_CORE, bounded
-from egovcp.cli import SelectedDatasetConfig, run_command
+from egovcp.cli import run_command
 from egovcp.data import DatasetReader, EpisodeStore
+from egovcp.dataset_options import SelectedDatasetConfig
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.files import write_text
-from egovcp.outputs import require_writable
+from egovcp.files import write_json
+from egovcp.hardware import available_cores
+from egovcp.manifest import finite_or_null
 from egovcp.policy_options import PolicyOptions
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
+from egovcp_train.checkpoint import prepare_output
 from egovcp_train.datasets import EVALUATION_EPISODES
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.pictures import draw, record, table
@@ -41,7 +43,7 @@ class HeldoutConfig:
     """
 
     output_dir: str
-    """Folder for heldout.json and the pictures; other files in it stay."""
+    """New folder for heldout.json and the pictures."""
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
@@ -72,18 +74,18 @@ def evaluate(config: HeldoutConfig) -> None:
     After Ctrl-C the measures of the episodes so far are written, marked as incomplete.
 
     Raises:
-        UsageError: an option is wrong.
+        UsageError: an option is wrong, the folder is not empty, or the policy is of another robot.
         ArtifactError: the policy is damaged, or of another low-level controller.
         DataError: the dataset is damaged.
         EnvironmentFailure: the folder cannot be written.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     output = _check(config)
-    torch.set_num_threads(config.threads or torch.get_num_threads())
+    torch.set_num_threads(config.threads or available_cores())
     device = choose_device(config.device)
     reader = DatasetReader.open(config.dataset)
     artifact = load_artifact(config.policy.path, config.policy.revision)
-    require_same_controller(artifact, reader)
+    require_same_robot(artifact, reader)
     returns = returns_of(artifact)
     limit = config.episodes or None
     store = EpisodeStore.load([reader], config.split, returns, per_task=limit)
@@ -113,13 +115,22 @@ def _check(config: HeldoutConfig) -> Path:
     """Check the options before any work starts; returns the output folder."""
     if not config.policy.path:
         raise UsageError("no policy given: --policy.path=RUN/checkpoints/last/pretrained_model")
-    output = Path(config.output_dir)
-    require_writable(output)
-    return output
+    return prepare_output(config.output_dir, resume=False, resumable=False)
 
 
-def require_same_controller(artifact: Artifact, reader: DatasetReader) -> None:
-    """Raise `ArtifactError` unless policy and data have the same low-level controller."""
+def require_same_robot(artifact: Artifact, reader: DatasetReader) -> None:
+    """Raise unless policy and data have the same robot and low-level controller.
+
+    Raises:
+        UsageError: the robot, its sizes or its action box differ.
+        ArtifactError: the low-level controller differs.
+    """
+    if artifact.robot != reader.robot:
+        raise UsageError(
+            f"{artifact.path} was trained on data of robot {artifact.robot.robot_type}, "
+            f"{reader.root} is of robot {reader.robot.robot_type}, or their names, sizes or ranges "
+            "of actions differ; choose a dataset of the policy's robot, such as its training data"
+        )
     if artifact.controller_id != reader.controller_id:
         raise ArtifactError(
             f"{artifact.path} was trained on data of low-level controller "
@@ -147,7 +158,7 @@ def _run(config: HeldoutConfig, artifact: Artifact, reader: DatasetReader) -> di
 def _write(output: Path, report: HeldoutReport, run: dict[str, Any]) -> None:
     output.mkdir(parents=True, exist_ok=True)
     content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
-    write_text(output / RESULT, json.dumps(content, indent=2) + "\n")
+    write_json(output / RESULT, finite_or_null(content))
 
 
 def _show(output: Path, report: HeldoutReport, depth_max_m: float) -> None:

@@ -15,8 +15,8 @@ from egovcp_train.lowlevel.physics import Snapshot
 from egovcp_train.lowlevel.sensing import (
     TorsoMotion,
     heading,
-    in_heading,
     standing_feet,
+    to_heading_xy,
 )
 
 Array = NDArray[np.float64]
@@ -41,7 +41,9 @@ class AverageVelocity:
     def add(self, x: Snapshot) -> None:
         """Adds a tick of 20 ms."""
         forward = heading(rotation_matrix(x.quaternion))
-        now = np.concatenate([in_heading(x.velocity, forward), x.angular_velocity[:, 2:]], axis=1)
+        now = np.concatenate(
+            [to_heading_xy(x.velocity, forward), x.angular_velocity[:, 2:]], axis=1
+        )
         self.value += DT / _AVERAGE_S * (np.nan_to_num(now) - self.value)
 
 
@@ -78,8 +80,8 @@ def terms(
     up = turn[:, 2]  # the world's vertical in the pelvis frame
     off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
     on = standing_feet(x)
-    feet = in_heading(x.feet - x.position[:, None], forward)
-    ahead = in_heading(x.feet_forward, forward)
+    feet = to_heading_xy(x.feet - x.position[:, None], forward)
+    ahead = to_heading_xy(x.feet_forward, forward)
     width = feet[:, 0, 1] - feet[:, 1, 1]
     torque = x.torque[:, :NU] / EFFORT_LIMIT[:NU]
     slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * on

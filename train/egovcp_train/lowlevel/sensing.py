@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.g1 import WAIST
 from egovcp.robot.geometry import focal_length, rotation_matrix, rotation_vector
-from egovcp.robot.kinematics import torso_rotation
+from egovcp.robot.kinematics import ANKLE_HEIGHT, torso_rotation
 from egovcp.sim.config import CameraConfig
 from egovcp.spec import (
     COMMAND_SLICE,
@@ -30,18 +30,17 @@ Array = NDArray[np.float64]
 FOCAL: Final = focal_length(CameraConfig().vertical_fov)
 """Pixels per rad at the centre of the depth image."""
 PRIVILEGED_DIM: Final = 2 + 3 + 1 + 1 + 2 + 2 + 4 + 1 + 1  # see `privileged`
-SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
-_CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
+_CONTACT_MARGIN: Final = 0.012  # m above ANKLE_HEIGHT, below which a foot counts as standing
 _MAX_TORSO_RATE: Final = 20.0  # rad/s, bound for robots whose simulation diverges
 
 
-def heading(turn: Array) -> Array:
+def heading(rotation: Array) -> Array:
     """(N, 3, 3) rotations -> (N, 2) unit vector of the horizontal forward direction."""
-    forward = turn[:, :2, 0]
+    forward = rotation[:, :2, 0]
     return np.asarray(forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-6))
 
 
-def in_heading(vector: Array, forward: Array) -> Array:
+def to_heading_xy(vector: Array, forward: Array) -> Array:
     """World vectors (N, ..., 2 or 3) -> their x and y in the heading frame (N, ..., 2)."""
     shape = (len(forward), *(1,) * (vector.ndim - 2))
     c, s = forward[:, 0].reshape(shape), forward[:, 1].reshape(shape)
@@ -51,7 +50,7 @@ def in_heading(vector: Array, forward: Array) -> Array:
 
 def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
     """(N, 2) which feet are on the floor."""
-    on: NDArray[np.bool_] = x.feet[..., 2] < SOLE_HEIGHT + _CONTACT
+    on: NDArray[np.bool_] = x.feet[..., 2] < ANKLE_HEIGHT + _CONTACT_MARGIN
     return on
 
 
@@ -74,19 +73,19 @@ def privileged(
 ) -> NDArray[np.float32]:
     """Additional input of the critic, (N, 17).
 
-    Velocity 2, its average with that of the turning 3, upward velocity 1, height error 1, feet on
-    the floor 2, their heights 2, their positions along and across 4, friction 1, distance of a
-    wall 1.
+    Horizontal velocity (2), running average of it and of the yaw rate (3), upward velocity (1),
+    height error (1), feet on the floor (2), their heights (2), their positions along and across
+    (4), friction (1), distance of a wall (1).
     """
     forward = heading(rotation_matrix(x.quaternion))
     columns = [
-        in_heading(x.velocity, forward),
+        to_heading_xy(x.velocity, forward),
         motion,
         x.velocity[:, 2:],
         (x.position[:, 2] - height)[:, None],
         standing_feet(x),
         x.feet[..., 2],
-        in_heading(x.feet - x.position[:, None], forward).reshape(-1, 4),
+        to_heading_xy(x.feet - x.position[:, None], forward).reshape(-1, 4),
         friction[:, None],
         wall[:, None],
     ]

@@ -28,7 +28,7 @@ _RAMP: Final = 25  # ticks from standing to the commanded velocity
 
 @dataclass(frozen=True)
 class Skill:
-    """One row of the table."""
+    """A skill: one row of the table in docs/lowlevel.md."""
 
     name: str
     about: str
@@ -38,9 +38,9 @@ class Skill:
     settled_only: bool = False
     """Measure hands and height only after their target has been held for 0.6 s."""
     push: float = 0.0
-    """m/s of an impulse, after 1 s."""
-    push_any: bool = True
-    """Whether the impulse has a random horizontal direction; else forwards or backwards."""
+    """Sudden change of base velocity after 1 s, m/s."""
+    push_any_direction: bool = True
+    """Whether the push has a random horizontal direction; else forwards or backwards."""
 
     @property
     def ticks(self) -> int:
@@ -64,13 +64,14 @@ def random_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
 def held_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
     """As `egovcp-collect --eta=1 --step_ticks=[5,15]`: targets held for 5 to 15 planner ticks."""
     target, sent = np.zeros((2, robots, ACTION_DIM))
-    wait: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)
+    ticks_left: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)
     walk = []
     for _ in range(ticks // CONTROLLER_TICKS_PER_PLAN):
-        steps = wait <= 0
-        wait = np.where(steps, rng.integers(*HELD_TICKS, robots, endpoint=True), wait) - 1
-        step = rng.uniform(-1, 1, target.shape)
-        target = reflect(target + np.where(steps[:, None], step, 0.0))
+        due = ticks_left <= 0
+        drawn = rng.integers(*HELD_TICKS, robots, endpoint=True)
+        ticks_left = np.where(due, drawn, ticks_left) - 1
+        change = rng.uniform(-1, 1, target.shape)
+        target = reflect(target + np.where(due[:, None], change, 0.0))
         sent = sent + np.clip(target - sent, -ACTION_RATE_LIMIT, ACTION_RATE_LIMIT)
         walk.append(sent)
     return _commands(np.repeat(np.array(walk), CONTROLLER_TICKS_PER_PLAN, axis=0))
@@ -149,14 +150,16 @@ SKILLS: Final = (
         "crouch", "10 s at 0.2 to 0.4 m/s, 0.58 to 0.62 m", 10.0, walking((0.2, 0.4), (0.58, 0.62))
     ),
     Skill("low", "10 s at 0.2 to 0.4 m/s, 0.55 m", 10.0, walking((0.2, 0.4), (0.55, 0.55))),
-    Skill("push", "an impulse of 0.5 m/s while standing", 6.0, neutral, push=0.5),
+    Skill(
+        "push", "a sudden change of base velocity of 0.5 m/s while standing", 6.0, neutral, push=0.5
+    ),
     Skill(
         "hard_push",
-        "an impulse of 0.8 m/s forwards or backwards while standing",
+        "a sudden change of base velocity of 0.8 m/s forwards or backwards while standing",
         6.0,
         neutral,
         push=0.8,
-        push_any=False,
+        push_any_direction=False,
     ),
     Skill("rest", "60 s at the neutral pose", 60.0, neutral),
 )

@@ -42,7 +42,7 @@ from egovcp_train.lowlevel.physics import (
     neutral_qpos,
     random_delays,
 )
-from egovcp_train.lowlevel.sensing import heading, in_heading, measure
+from egovcp_train.lowlevel.sensing import heading, measure, to_heading_xy
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ class _Series:
         pelvis = to_heading @ turn
         torso = torso_rotation(pelvis, x.joints[:, WAIST])
         hands = command[:, 3:9].reshape(-1, 2, 3)
-        planar = in_heading(x.velocity, forward)
+        planar = to_heading_xy(x.velocity, forward)
         if len(self._found["height"]) % CONTROLLER_TICKS_PER_PLAN == 0:
             self._found["torso"].append(np.nan_to_num(sensing.torso(x)))
         for name, value in {
@@ -152,7 +152,7 @@ def play(
 
 def _directions(skill: Skill, robots: int, rng: np.random.Generator) -> Array:
     """(N,) rad from the direction that the robots face."""
-    if skill.push_any:
+    if skill.push_any_direction:
         return rng.uniform(-np.pi, np.pi, robots)
     return np.asarray(rng.choice([0.0, np.pi], robots))
 

@@ -12,7 +12,7 @@ from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
 from egovcp_train.lowlevel.commands import Commands, between, horizontal
 from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.physics import NO_WALL, Snapshot
-from egovcp_train.lowlevel.sensing import heading, in_heading
+from egovcp_train.lowlevel.sensing import heading, to_heading_xy
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ class Walls:
         chosen &= ~self._active[rows]
         ahead = heading(rotation_matrix(x.quaternion[rows]))
         facing = np.arctan2(ahead[:, 1], ahead[:, 0])
-        palms = in_heading(x.palms[rows] - x.position[rows][:, None], ahead)[..., 0].max(axis=1)
+        palms = to_heading_xy(x.palms[rows] - x.position[rows][:, None], ahead)[..., 0].max(axis=1)
         distance = np.maximum(rng.uniform(*_DISTANCE, n), palms + _CLEARANCE)
         chosen &= np.isfinite(distance)
         surface = np.concatenate(

@@ -31,7 +31,7 @@ from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
-MIN_PAUSE: Final = 1.5  # s: in HOLD the robot takes 1 s to return to its neutral pose
+_MIN_PAUSE: Final = 1.5  # s: in HOLD the hands take up to 1 s to return to the neutral pose
 _MAX_STEPS: Final = 20  # caught up after a delay; the rest are dropped
 _EPILOG: Final = (
     "Motors use LeRobot's JSON over ZMQ, depth the format of egovcp-depth-server. Without a "
@@ -52,7 +52,7 @@ class FakeG1Config:
     """
 
     task: str = DEFAULT_TASK
-    """Scene: one of `egovcp-task list`, or package.module:Class."""
+    """Scene: a name from `egovcp-task list`, or package.module:Class."""
     seed: int = bounded(0, least=0, below=SEEDS)
     """Seed of the held-out scenarios, as in egovcp-eval."""
     episode: int = bounded(0, least=0)
@@ -64,9 +64,8 @@ class FakeG1Config:
     robot, s; 0: at the first command; null: only on the command release."""
     settle: float = bounded(2.0, least=0)
     """Delay between release and the start of the task, s."""
-    pause: float = bounded(2.0, least=0)
-    """Time between the end of an episode and the next, which starts on the gantry, s; at least
-    1.5."""
+    pause: float = bounded(2.0, least=_MIN_PAUSE)
+    """Time between the end of an episode and the next, which starts on the gantry, s."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
     detailed: bool = False
@@ -114,14 +113,19 @@ def _serve(config: FakeG1Config, interrupts: Sequence[int]) -> None:
                     return
                 if bridge.faults.crash:
                     os._exit(1)
-                if config.json and len(episodes.outcomes) > written:
+                if len(episodes.outcomes) > written:
                     written = len(episodes.outcomes)
-                    report = [outcome_json(outcome) for outcome in episodes.outcomes]
-                    write_report(config.json, report, durable=False)  # fsync delays the robot
+                    _write_outcomes(config.json, episodes.outcomes)
         finally:
+            _write_outcomes(config.json, episodes.outcomes)
             if outcomes := episodes.outcomes:
                 successes = sum(outcome.success for outcome in outcomes)
                 _print(f"{len(outcomes)} episodes, {successes} successes")
+
+
+def _write_outcomes(file: str, outcomes: Sequence[EpisodeOutcome]) -> None:
+    report = [outcome_json(outcome) for outcome in outcomes]
+    write_report(file, report, durable=False)  # fsync delays the robot
 
 
 def _apply_lines(lines: queue.SimpleQueue[str], faults: InjectedFaults) -> bool:
@@ -218,7 +222,7 @@ class EpisodeSequencer:
                 robot.release()
         elif self._phase is Phase.FREE and self._since >= self._config.settle:
             robot.begin()
-        elif self._phase is Phase.OVER and self._since >= max(MIN_PAUSE, self._config.pause):
+        elif self._phase is Phase.OVER and self._since >= self._config.pause:
             self._start()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -9,8 +10,9 @@ from egovcp.errors import UsageError, suggest
 from egovcp.spec import JOINT_NAMES
 
 _PUSH: Final = (-2.5, 1.0)  # m/s: no controller withstands it
-_DEFAULT_JOINT: Final = JOINT_NAMES.index("left_ankle_roll_joint")  # overheats first on real robots
+_DEFAULT_JOINT: Final = JOINT_NAMES.index("left_ankle_roll_joint")
 _HOT: Final = 125.0  # deg C
+_VALUES: Final = {"push": 2, "hot_motor": 2, "dropped_motor": 1, "drop": 1, "mode": 1}  # at most
 
 
 @dataclass
@@ -44,6 +46,9 @@ class InjectedFaults:
         word, *rest = line.split() or ["release"]
         if word not in FAULT_COMMANDS:
             raise UsageError(f"unknown {word!r}{suggest(word, FAULT_COMMANDS)}")
+        if len(rest) > (most := _VALUES.get(word, 0)) and rest != ["off"]:
+            values = f"at most {most} values" if most else "nothing"
+            raise UsageError(f"found {' '.join(rest)!r} after {word}, expected {values}, or off")
         if word == "clear":
             self._reset(*(f.name for f in fields(self)))
         elif rest == ["off"]:
@@ -71,15 +76,16 @@ class InjectedFaults:
 def _numbers(
     words: list[str], example: str, count: int, *, high: float | None = None
 ) -> list[float]:
-    """Parse ``count`` numbers, from 0 to ``high`` if that is given."""
+    """Parse ``count`` finite numbers, from 0 to ``high`` if that is given."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) == count and (high is None or all(0.0 <= n <= high for n in numbers)):
+    valid = all(math.isfinite(n) and (high is None or 0.0 <= n <= high) for n in numbers)
+    if len(numbers) == count and valid:
         return numbers
     limits = "" if high is None else f" from 0 to {high:g}"
-    raise UsageError(f"expected {count} number(s){limits}, such as {example}")
+    raise UsageError(f"expected {count} finite number(s){limits}, such as {example}")
 
 
 def _joint(rest: list[str]) -> int:

@@ -3,7 +3,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AMX_INT8__) && !defined(WITHOUT_TILES)
+#if defined(__AMX_INT8__) && !defined(WITHOUT_AMX)
 #define TILES 1
 #endif
 #if defined(__AVX512VNNI__) && defined(__AVX512BW__)

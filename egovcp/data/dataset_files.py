@@ -1,5 +1,4 @@
-"""Writes, renames and flushes of dataset files, in one place, so that tests can simulate disk
-failures."""
+"""All disk writes of datasets, so that tests can simulate disk failures."""
 
 from __future__ import annotations
 
@@ -17,21 +16,21 @@ _RENAME_EXCHANGE: Final = 2  # linux/fs.h
 _NO_LINK: Final = (errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.ENOSYS, errno.EXDEV)
 
 
-def create(path: Path) -> IO[bytes]:
+def open_new(path: Path) -> IO[bytes]:
     """Open a new file for writing; its folder is created if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path.open("xb")
 
 
-def write_bytes(path: Path, content: bytes | memoryview) -> None:
+def create_file(path: Path, content: bytes | memoryview) -> None:
     """Write a new file."""
-    with create(path) as file:
+    with open_new(path) as file:
         file.write(content)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write ``content`` as strict JSON: NaN and infinities raise `ValueError`."""
-    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+def create_json(path: Path, content: Any) -> None:
+    """Write a new file of ``content`` as strict JSON: NaN and infinities raise `ValueError`."""
+    create_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def sync_tree(folder: Path) -> None:
@@ -73,12 +72,10 @@ def exchange(one: Path, other: Path) -> None:
     Raises:
         OSError: EINVAL or ENOSYS if the system or the file system does not support it.
     """
-    if not sys.platform.startswith("linux"):
-        raise OSError(errno.ENOSYS, "exchanging folders needs Linux", str(one))
-    libc = ctypes.CDLL(None, use_errno=True)
-    code = libc.renameat2(
-        _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
-    )
-    if code != 0:
+    is_linux = sys.platform.startswith("linux")
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if is_linux else None
+    if renameat2 is None:  # the C library may be older than the system call
+        raise OSError(errno.ENOSYS, "exchanging folders needs renameat2 of Linux", str(one))
+    if renameat2(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE):
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number), str(one))
