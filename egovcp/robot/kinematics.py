@@ -145,7 +145,8 @@ def link_transforms(joint_position: Array) -> tuple[Array, Array]:
 def foot_positions(joint_position: Array) -> Array:
     """(B, 2, 3) m, left and right ankle-roll link in the pelvis frame, of (B, J) rad."""
     n, legs = len(joint_position), slice(0, _NUM_LEG_JOINTS)
-    local = joint_rotations(joint_position[:, legs], legs).reshape(n, 2, -1, 3, 3)
+    local = joint_rotations(joint_position[:, legs], legs)
+    local = local.reshape(n, 2, _NUM_LEG_JOINTS // 2, 3, 3)
     offset = JOINT_OFFSET[legs].reshape(2, -1, 3)
     rotation, position = local[:, :, 0], np.tile(offset[:, 0], (n, 1, 1))
     for k in range(1, local.shape[2]):

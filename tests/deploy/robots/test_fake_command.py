@@ -61,7 +61,7 @@ def test_it_ends_on_an_interrupt() -> None:
     [
         ("--task=bal", 2, "did you mean 'ball'"),
         ("--episode=-1", 2, "--episode=-1: expected at least 0"),
-        ("--pause=1", 2, "--pause=1: expected at least 1.5"),
+        ("--pause=1", 2, "--pause=1.0: expected at least 1.5"),
         ("--json=/dev/null/all.json", 2, "/dev/null is not a folder"),
     ],
 )
