@@ -172,8 +172,8 @@ def test_a_speed_jump_is_accepted_once_positions_follow() -> None:
 @pytest.mark.parametrize(
     "situation",
     [
-        Situation("steered and pushed", "walk", "ball", steered=True),
-        Situation("wall", "walk", "wall"),
+        Situation("steered and pushed", "ball", steered=True),
+        Situation("wall", "wall"),
     ],
     ids=lambda situation: situation.name,
 )

@@ -7,7 +7,7 @@ Its readings pass the same checks as those of a robot. None may be rejected, and
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -39,22 +39,17 @@ _PUSH: Final = 0.3  # m/s
 
 @dataclass(frozen=True)
 class Situation:
-    """Controller and task."""
+    """What the robot does, with the walking controller."""
 
     name: str
-    controller: str
     task: str
     steered: bool = False
     """Whether an operator steers the robot, and it is pushed; the task does not begin."""
 
 
 SITUATIONS: Final = (
-    Situation("steered and pushed", "walk", "ball", steered=True),
-    Situation("wall, walk", "walk", "wall"),
-    Situation("arch, walk", "walk", "arch"),
-    Situation("ball, walk", "walk", "ball"),
-    Situation("wall, stance", "stance", "wall"),
-    Situation("ball, stance", "stance", "ball"),
+    Situation("steered and pushed", "ball", steered=True),
+    *(Situation(task, task) for task in ("wall", "arch", "ball")),
 )
 
 
@@ -143,7 +138,7 @@ class HealthyRun:
     def __init__(self, situation: Situation, seed: int = 0) -> None:
         self._situation, self._seed = situation, seed
         self._rng = np.random.default_rng(seed)
-        self._robot = LiveRobot(replace(evaluation_config(), controller=situation.controller))
+        self._robot = LiveRobot(evaluation_config())
         self.alarms = Alarms()
 
     def play(self, episode: int, max_s: float = np.inf) -> None:
@@ -155,7 +150,7 @@ class HealthyRun:
         checked = _CheckedRobot(robot, clock, alarms)
         checked.step()
         pilot = Pilot(InlinePlanner(PlannerRunner(_OraclePolicy(robot))), state=State.ARMED)
-        controller = make_controller(self._situation.controller)
+        controller = make_controller("walk")
         loop = ControlLoop(checked, checked.camera, controller, pilot)
         limit = min(max_s, _STEERED_S if self._situation.steered else np.inf)
         tick, events = 0, list[str]()
