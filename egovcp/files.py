@@ -200,6 +200,15 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
         temporary.replace(path)
 
 
+def sync(path: Path) -> None:
+    """Flush one file or folder to the disk; that of a folder makes the names in it durable."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def write_text(path: Path, text: str, durable: bool = True) -> None:
     """Create or replace a UTF-8 text file; see `write_bytes`."""
     write_bytes(path, text.encode(), durable)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.lerobot import Feature
+from egovcp.data.features import Feature
 
 type Statistics = dict[str, NDArray[np.float64]]
 """Name of a statistic -> value for each value of a feature."""

@@ -31,7 +31,8 @@ from egovcp.checks.lerobot_episode import (
     value_problems,
 )
 from egovcp.data import schema
-from egovcp.data.lerobot import EpisodeRow, LeRobotReader, values_of
+from egovcp.data.features import values_of
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.pictures import decode_frames, frame_times
 from egovcp.data.stats import aggregate_named

@@ -10,7 +10,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.data import schema
-from egovcp.data.lerobot import Feature, LeRobotReader
+from egovcp.data.features import Feature
+from egovcp.data.lerobot import LeRobotReader
 from egovcp.data.pictures import decode_image
 from egovcp.errors import DataError, SchemaError
 

@@ -15,7 +15,8 @@ from tqdm import tqdm
 from egovcp import spec
 from egovcp.data import tiff
 from egovcp.data.episode import Episode
-from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, is_own, values_of
+from egovcp.data.features import Feature, values_of
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
 from egovcp.data.pictures import camera_images
 from egovcp.data.provenance import Provenance
 from egovcp.data.source import Source, select_episodes

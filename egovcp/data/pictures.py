@@ -13,7 +13,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.data import tiff
-from egovcp.data.lerobot import EpisodeRow, Feature
+from egovcp.data.features import Feature
+from egovcp.data.lerobot import EpisodeRow
 from egovcp.errors import DataError
 
 _LARGEST_CODE: Final = 4095  # of a depth video, 12 bits

@@ -24,6 +24,7 @@ from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.files import sync
 from egovcp.log.messages import Topic, encode_tick, message_type
 from egovcp.log.ros2 import definition
 from egovcp.log.tick import RunInfo, Tick
@@ -53,15 +54,6 @@ def checksum_matches(metadata: Mapping[str, str]) -> bool:
 
 def _checksum(metadata: Mapping[str, str]) -> str:
     return f"{zlib.crc32(json.dumps(dict(metadata), sort_keys=True).encode()):08x}"
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the name of a new file durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @dataclass(frozen=True)
@@ -109,7 +101,7 @@ class McapFile:
             self._writer.start(profile=Profile.ROS2, library="egovcp")
             self._writer.add_metadata(METADATA_NAME, self._metadata)
             self.flush()
-            _sync_folder(self._path.absolute().parent)
+            sync(self._path.absolute().parent)
         except BaseException:
             file, self._file = self._file, None
             self._path.unlink(missing_ok=True)

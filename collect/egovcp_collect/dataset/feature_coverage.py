@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.checks.feature_statistics import Statistics, describe
-from egovcp.data.lerobot import LeRobotReader, values_of
+from egovcp.data.features import values_of
+from egovcp.data.lerobot import LeRobotReader
 from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError
 from egovcp.terminal import echo, echo_lines

@@ -10,7 +10,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, values_of
+from egovcp.data.features import Feature, values_of
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader
 from egovcp.data.pictures import camera_images
 from egovcp.errors import EnvironmentFailure
 from egovcp.files import removed_on_error

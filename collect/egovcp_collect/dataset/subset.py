@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from egovcp.checks.feature_statistics import Statistics, describe
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import dataset_files, schema
-from egovcp.data.lerobot import EpisodeRow, Feature, LeRobotReader, VideoSpan
+from egovcp.data.features import Feature
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
 from egovcp.data.stats import QUANTILES, aggregate_named

@@ -65,7 +65,7 @@ def control_process(setup: ControlSetup) -> None:
             try:
                 control = ControlProcess(setup, hardware, link)
                 if not raise_priority(CONTROL_PRIORITY):
-                    control.warn(f"warning: {NO_PRIORITY}")
+                    control.add_event(f"warning: {NO_PRIORITY}")
                 gc.freeze()  # imported objects are not searched for garbage again
                 control.run(stopping)
             finally:
@@ -92,10 +92,9 @@ class ControlProcess:
         self._remote = RemoteOperator()
         self._orphaned = 0
 
-    def warn(self, line: str) -> None:
-        """Print ``line`` and add it to the events of the run, without blocking."""
-        print_without_blocking(f"egovcp-deploy: {line}")
-        self._loop.pilot.add_events([line])
+    def add_event(self, event: str) -> None:
+        """Report ``event`` to the planner's process, which prints and logs it."""
+        self._loop.pilot.add_events([event])
 
     def run(self, stopping: Sequence[int]) -> None:
         """Run until a quit command, or until ``stopping`` is not empty."""
@@ -117,9 +116,9 @@ class ControlProcess:
             return
         idle = self._loop.state in (State.INIT, State.DAMP)
         if self._planner.alive and not idle:
-            self.warn(
-                "the planner's process has ended; the robot is held until it is damped: by kill "
-                f"{os.getpid()}, or by L1 + B on its remote control"
+            print_without_blocking(
+                "egovcp-deploy: the planner's process has ended; the robot is held until it is "
+                f"damped: by kill {os.getpid()}, or by L1 + B on its remote control"
             )
         self._planner.alive = False
         self._orphaned += idle

@@ -181,7 +181,7 @@ def run(stopping):
 c.open_hardware = lambda bridge, camera: hardware
 c.Link = lambda address, serve: Stub(close=lambda: None)
 c.raise_priority = lambda level: False
-c.ControlProcess = lambda setup, hardware, link: Stub(run=run, warn=lambda line: print(line))
+c.ControlProcess = lambda setup, hardware, link: Stub(run=run, add_event=lambda event: print(event))
 c.damp_motors = lambda body: print("damped")
 c.control_process(Stub(bridge=None, camera=None, address=""))
 """
