@@ -14,6 +14,7 @@ from report import parser, publish
 
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import noise_std
@@ -79,7 +80,7 @@ def run_skill(
                 np.zeros(3),
                 motors=MotorReadings(torque, _TEMPERATURE),
             )
-            motors = MotorCommand(target[i], controller.stiffness, controller.damping)
+            motors = MotorCommand(target[i], STIFFNESS, DAMPING)
             verdict = watches[i].update(reading, motors)
             seconds += 1.0 / CONTROLLER_HZ
             if reason := verdict.damp or verdict.hold:

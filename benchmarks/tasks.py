@@ -31,7 +31,8 @@ from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PLANNER_DT
 from egovcp_deploy.controllers import Action, search_constant
-from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
+from egovcp_deploy.episodes import EpisodeGroup, EpisodePool
+from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore, eval_scores
 
@@ -77,7 +78,8 @@ def measure(
 ) -> dict[str, Result]:
     """Controller -> metrics."""
     scenarios = [held_out(task, seed, i) for i in range(episodes)]
-    with closing(EpisodePool(EpisodeSetup(env, seed=seed), workers)) as pool:
+    config = EvalConfig(env=env, seed=seed, num_workers=workers)
+    with closing(EpisodePool(config)) as pool:
 
         def hold_each(
             actions: Sequence[Action], scenarios: Sequence[Scenario]

@@ -85,23 +85,13 @@ class _Unwatched(MotorWatch):
 
 
 def _loop(hardware: Hardware, checked: bool) -> ControlLoop:
-    body = hardware.body
     pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned())), state=State.ARMED)
     controller = make_controller(_CONTROLLER)
-    if not checked:
-        loop = ControlLoop(body, hardware.camera, controller, pilot)
-        loop._motor_watch = _Unwatched()
-        return loop
-    return ControlLoop(
-        body,
-        hardware.camera,
-        controller,
-        pilot,
-        refusal=lambda: body.refusal,
-        fault=lambda: body.fault,
-        skipped=lambda: body.rejected,
-        link=hardware.link,
-    )
+    if checked:
+        return ControlLoop(hardware.body, hardware.camera, controller, pilot, hardware.link)
+    loop = ControlLoop(hardware.body, hardware.camera, controller, pilot)
+    loop._motor_watch = _Unwatched()
+    return loop
 
 
 def control_figures(rounds: int) -> dict[str, object]:

@@ -27,7 +27,7 @@ from report import parser, publish
 from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.data.committer import open_committer
-from egovcp.data.staging import StagedEpisode, encode
+from egovcp.data.staging import encode
 from egovcp.testing import random_episode
 
 PROVENANCE = Provenance("benchmark")
@@ -77,7 +77,7 @@ def service(root: Path, episodes: Sequence[Episode]) -> None:
     """Sealed one by one, committed together."""
     with open_committer(root, PROVENANCE) as committer:
         for number, episode in enumerate(episodes):
-            committer.staging.put(StagedEpisode.of(number, encode(episode)))
+            committer.staging.put(number, encode(episode))
             committer.mark_staged(number)
         committer.commit()
 

@@ -2,16 +2,13 @@
 
 import contextlib
 import io
-import os
-import tomllib
 from importlib import import_module
-from pathlib import Path
+from importlib.metadata import EntryPoint, entry_points
 from pkgutil import iter_modules
 from types import ModuleType
 
 import mkdocs_gen_files
 
-ROOT = Path(__file__).resolve().parents[1]
 #: Public modules and packages, in the order of the page.
 MODULES = (
     "egovcp.spec",
@@ -30,22 +27,11 @@ MODULES = (
 )
 
 
-def commands() -> dict[str, str]:
-    """Name of each command -> its entry point, ``module:function``."""
-    found: dict[str, str] = {}
-    for project in sorted(ROOT.glob("**/pyproject.toml")):
-        if not {".venv", "outputs", "tests"} & set(project.relative_to(ROOT).parts):
-            found |= tomllib.loads(project.read_text())["project"].get("scripts", {})
-    return dict(sorted(found.items()))
-
-
-def help_of(entry_point: str) -> str:
+def help_of(command: EntryPoint) -> str:
     """The complete help of a command."""
-    module, function = entry_point.split(":")
-    command = getattr(import_module(module), function)
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
-        command(["--help=all"])
+        command.load()(["--help=all"])
     return output.getvalue()
 
 
@@ -61,11 +47,12 @@ def members(module: ModuleType) -> list[str]:
 
 def write_commands() -> None:
     """One section per command."""
-    os.environ["COLUMNS"] = "100"
+    scripts = sorted(entry_points(group="console_scripts"), key=lambda script: script.name)
     with mkdocs_gen_files.open("reference/commands.md", "w") as page:
         page.write("# Commands\n\nThe output of `--help=all` of every command.\n")
-        for name, entry_point in commands().items():
-            page.write(f"\n## {name}\n\n```text\n{help_of(entry_point)}```\n")
+        for command in scripts:
+            if command.name.startswith("egovcp-"):
+                page.write(f"\n## {command.name}\n\n```text\n{help_of(command)}```\n")
 
 
 def write_api() -> None:

@@ -144,18 +144,13 @@ def check_cores(config: Any, prefix: str = "") -> None:
 
     Not part of `check_bounds`, because a config may describe work on another machine.
     """
+    cores = available_cores()
     for name, option, value in leaf_options(config, prefix):
         bounds = bounds_of(option)
-        if bounds is not None and bounds.per_core is not None:
-            require_cores(name, value, bounds.per_core)
-
-
-def require_cores(option: str, count: int, per_core: int = MAX_PER_CORE) -> None:
-    """Raise `OutOfBounds` for more than ``per_core`` threads or processes per processor core."""
-    cores = available_cores()
-    if count > per_core * cores:
-        expected = f"at most {per_core * cores}, {per_core} for each of {cores} processor cores"
-        raise OutOfBounds(option, count, expected)
+        most = bounds.per_core if bounds is not None else None
+        if most is not None and value > most * cores:
+            expected = f"at most {most * cores}, {most} for each of {cores} processor cores"
+            raise OutOfBounds(name, value, expected)
 
 
 def _is_finite(number: float) -> bool:

@@ -90,10 +90,6 @@ class GraphedFunction:
         graph.replay()
         return _map(graph.results, Tensor.clone) if self._copies else graph.results
 
-    @property
-    def num_graphs(self) -> int:
-        return sum(graph is not None for graph in self._graphs.values())
-
     @torch.inference_mode(False)  # buffers are written under both modes
     @torch.no_grad()
     def _make(self, arguments: tuple[Any, ...]) -> _Graph | None:

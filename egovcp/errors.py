@@ -53,10 +53,10 @@ class DataError(EgovcpError):
         return error
 
     @classmethod
-    def without_place(cls, problem: str) -> Self:
-        """An error whose place the caller adds."""
-        error = cls(problem)
-        error.problem = problem
+    def without_place(cls, problem: str, frame: int | None = None) -> Self:
+        """An error, of one frame or not, whose file and episode the caller adds."""
+        error = cls(problem if frame is None else f"frame {frame}: {problem}")
+        error.problem, error.frame = problem, frame
         return error
 
 

@@ -28,7 +28,7 @@ import numpy as np
 JSON_LIMIT_BYTES: Final = 4 << 20
 """Default size limit of a JSON file. Parsed JSON takes up to about 30 times as much memory."""
 JSON_LIMIT_DEPTH: Final = 32
-"""Default limit of how deeply lists and objects are nested."""
+"""Limit of how deeply lists and objects are nested."""
 
 _KINDS: Final[Mapping[int, str]] = {
     stat.S_IFDIR: "a folder",
@@ -86,33 +86,23 @@ def read_text(path: Path, limit_bytes: int) -> str:
         raise UnsafeFileError(f"byte {error.start} is not UTF-8") from error
 
 
-def read_json(
-    path: Path,
-    limit_bytes: int = JSON_LIMIT_BYTES,
-    limit_depth: int = JSON_LIMIT_DEPTH,
-    allow_nan: bool = False,
-) -> Any:
+def read_json(path: Path, limit_bytes: int = JSON_LIMIT_BYTES) -> Any:
     """The content of a JSON file; see `read_text` and `parse_json`."""
-    return parse_json(read_text(path, limit_bytes), limit_depth, allow_nan)
+    return parse_json(read_text(path, limit_bytes))
 
 
-def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool = False) -> Any:
+def parse_json(text: str) -> Any:
     """The value of an untrusted JSON text.
 
     Raises:
-        UnsafeFileError: it is not JSON, nested more deeply than ``limit_depth``, or holds a string
-            that is not valid Unicode, or, without ``allow_nan``, a number that is not finite.
+        UnsafeFileError: it is not JSON, nested more deeply than `JSON_LIMIT_DEPTH`, or holds a
+            string that is not valid Unicode, or a number that is not finite.
     """
-    hooks: dict[str, Any] = (
-        {} if allow_nan else {"parse_float": _finite, "parse_constant": _refuse_constant}
-    )
-    check_depth(text, limit_depth)
+    check_depth(text)
     try:
-        content = json.loads(text, **hooks)
+        content = json.loads(text, parse_float=_finite, parse_constant=_refuse_constant)
     except UnsafeFileError:
         raise
-    except RecursionError as error:
-        raise UnsafeFileError(_too_deep(limit_depth)) from error
     except ValueError as error:  # JSONDecodeError, or an integer of more than 4300 digits
         raise UnsafeFileError(f"not JSON: {error}") from error
     if "\\ud" in text.lower():  # escapes of surrogates: only pairs are valid
@@ -141,15 +131,12 @@ def _too_large(found: str, limit_bytes: int) -> str:
     return f"too large: {found} bytes, expected at most {limit_bytes}"
 
 
-def _too_deep(limit: int) -> str:
-    return f"nested more than {limit} levels deep"
-
-
-def check_depth(text: str, limit: int = JSON_LIMIT_DEPTH) -> None:
-    """Raise `UnsafeFileError` if brackets outside strings are nested more deeply than ``limit``."""
+def check_depth(text: str) -> None:
+    """Raise `UnsafeFileError` if brackets outside strings are nested more deeply than
+    `JSON_LIMIT_DEPTH`."""
     bare = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
-    if len(bare) and _DEPTH_CHANGE[bare].cumsum(dtype=np.int32).max() > limit:
-        raise UnsafeFileError(_too_deep(limit))
+    if len(bare) and _DEPTH_CHANGE[bare].cumsum(dtype=np.int32).max() > JSON_LIMIT_DEPTH:
+        raise UnsafeFileError(f"nested more than {JSON_LIMIT_DEPTH} levels deep")
 
 
 def _finite(text: str) -> float:

@@ -49,16 +49,6 @@ _DATASET_TYPES: Final[Mapping[str, Any]] = {
 }
 
 
-def feature_spec(robot: RobotSpec = G1) -> dict[str, Any]:
-    """Names and shapes of observations and actions, and the action box."""
-    return robot.to_json()
-
-
-def robot_of(manifest: Mapping[str, Any]) -> RobotSpec:
-    """The robot of a manifest that `read_manifest` has checked."""
-    return RobotSpec.from_json(manifest["features"])
-
-
 def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """A manifest with the SHA-256 of its content.
 
@@ -109,7 +99,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _check_features(path: Path, features: Any) -> None:
-    expected = feature_spec()
+    expected = G1.to_json()
     if json.dumps(features, sort_keys=True) == json.dumps(expected, sort_keys=True):
         return
     if isinstance(features, dict) and "robot_type" in features:
@@ -190,7 +180,7 @@ def _finite(path: Path) -> Iterator[None]:
 
 # --- LeRobot's processors ---------------------------------------------------------
 # LeRobot requires these files. Their steps change no number: the world model normalises its inputs.
-def input_features(robot: RobotSpec = G1) -> dict[str, Any]:
+def input_features(robot: RobotSpec) -> dict[str, Any]:
     """LeRobot's description of the observations."""
     return {
         spec.DEPTH_KEY: {"type": "VISUAL", "shape": [1, *robot.depth]},
@@ -198,7 +188,7 @@ def input_features(robot: RobotSpec = G1) -> dict[str, Any]:
     }
 
 
-def output_features(robot: RobotSpec = G1) -> dict[str, Any]:
+def output_features(robot: RobotSpec) -> dict[str, Any]:
     """LeRobot's description of the actions."""
     return {spec.ACTION_KEY: {"type": "ACTION", "shape": [robot.action_dim]}}
 

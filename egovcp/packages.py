@@ -6,9 +6,7 @@ The extras come from the metadata of the installed distributions.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from functools import cache
+from collections.abc import Iterable
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from types import MappingProxyType
@@ -35,8 +33,6 @@ DISTRIBUTIONS: Final = MappingProxyType(
 DATA_MODULES: Final = ("filelock", "pandas", "PIL", "pyarrow")
 #: Imports of the simulator: the extra `egovcp[sim]`.
 SIMULATOR_MODULES: Final = ("mjlab", "mujoco")
-#: Our own distributions, whose extras are searched.
-_OWN: Final = ("egovcp", "lerobot-env-egovcp", "lerobot-policy-egovcp", "lerobot-robot-egovcp")
 
 
 class MissingPackage(EnvironmentFailure):
@@ -81,32 +77,25 @@ def require_packages(distribution: str, purpose: str, *modules: str) -> None:
 def missing_package(
     error: ModuleNotFoundError, distribution: str, purpose: str
 ) -> MissingPackage | None:
-    """The error for a failed import; None if the module is our own or the standard library's.
+    """The error for a failed import; None if the package is installed or the standard library's.
 
     For the arguments see `require_packages`; ``distribution`` may be one of its modules.
     """
     top = (error.name or "").partition(".")[0]
-    own = distribution_of(top) in _OWN or top.startswith("egovcp_")
-    if not top or own or top in sys.stdlib_module_names or is_installed(top):
+    if not top or top in sys.stdlib_module_names or is_installed(top):
         return None
     return MissingPackage(_message(distribution_of(distribution), purpose, [top]))
 
 
 def install_command(distribution: str, *packages: str) -> str:
-    """The command that installs packages, by the extra with the most of them if there is one.
-
-    Prefers extras of the distribution itself to those of its dependencies, and small extras.
-    """
-    distribution = canonicalize_name(distribution)
+    """The command that installs packages: the smallest extra that has them all, of the distribution
+    or else of egovcp; the packages themselves if there is none."""
     wanted = {canonicalize_name(package) for package in packages}
-
-    def preference(option: tuple[str, frozenset[str]]) -> tuple[int, bool, int]:
-        name, contents = option
-        return len(wanted & contents), name.partition("[")[0] == distribution, -len(contents)
-
-    best, contents = max(_installable(distribution), key=preference)
-    targets = [f"'{best}'" if "[" in best else best] if wanted & contents else []
-    return " ".join(["pip install", *targets, *sorted(wanted - contents)])
+    for owner in (canonicalize_name(distribution), "egovcp"):
+        fitting = {name: has for name, has in _extras(owner).items() if wanted <= has}
+        if fitting:
+            return f"pip install '{owner}[{min(fitting, key=lambda name: len(fitting[name]))}]'"
+    return f"pip install {' '.join(sorted(wanted))}"
 
 
 def _message(distribution: str, purpose: str, modules: list[str]) -> str:
@@ -118,46 +107,25 @@ def _message(distribution: str, purpose: str, modules: list[str]) -> str:
     )
 
 
-def _installable(distribution: str) -> Iterator[tuple[str, frozenset[str]]]:
-    """(``NAME`` or ``NAME[EXTRA]``, its packages), of a distribution and its own dependencies."""
-    plain = _closure(distribution, "")
-    own = [distribution, *sorted(name for name in plain if _is_own(name) and name != distribution)]
-    for name in own:
-        yield name, _closure(name, "")
-        for extra in _extras(name):
-            yield f"{name}[{extra}]", _closure(name, extra)
+def _extras(distribution: str) -> dict[str, set[str]]:
+    """Name of each extra -> its packages."""
+    try:
+        names = metadata.metadata(distribution).get_all("Provides-Extra") or []
+    except metadata.PackageNotFoundError:
+        return {}
+    return {name: _packages_of(distribution, name) for name in names}
 
 
-@cache
-def _closure(distribution: str, extra: str) -> frozenset[str]:
-    """Direct requirements of ``distribution[extra]``, and those of our own distributions in it."""
-    found = {distribution}
-    for requirement in _requirements(distribution, extra):
-        name = canonicalize_name(requirement.name)
-        found.add(name)
-        if _is_own(name):
-            for inner in ("", *sorted(requirement.extras)):
-                if (name, inner) != (distribution, extra):
-                    found |= _closure(name, inner)
-    return frozenset(found)
-
-
-def _requirements(distribution: str, extra: str) -> list[Requirement]:
-    """Requirements on this platform with an extra; empty: without extras."""
-    with suppress(metadata.PackageNotFoundError):
-        found = [Requirement(text) for text in metadata.requires(distribution) or []]
-        return [r for r in found if r.marker is None or r.marker.evaluate({"extra": extra})]
-    return []
-
-
-def _extras(distribution: str) -> list[str]:
-    with suppress(metadata.PackageNotFoundError):
-        return sorted(metadata.metadata(distribution).get_all("Provides-Extra") or [])
-    return []
-
-
-def _is_own(distribution: str) -> bool:
-    return distribution in _OWN or distribution.startswith("egovcp-")
+def _packages_of(distribution: str, extra: str) -> set[str]:
+    """The packages of an extra, also of those of egovcp in it."""
+    found: set[str] = set()
+    for requirement in map(Requirement, metadata.requires(distribution) or []):
+        if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+            found.add(canonicalize_name(requirement.name))
+            if requirement.name == "egovcp":
+                for name in requirement.extras:
+                    found |= _packages_of("egovcp", name)
+    return found
 
 
 def import_class[T](reference: str, base: type[T], known_as: str) -> type[T]:

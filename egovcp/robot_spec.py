@@ -8,7 +8,7 @@ values are the constants of `egovcp.spec`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -75,39 +75,39 @@ class RobotSpec:
         for problem in self._problems():
             raise UsageError(f"robot {self.robot_type!r}: {problem}")
 
-    def _problems(self) -> list[str]:
-        found = []
+    def _problems(self) -> Iterator[str]:
         rows, cols = self.depth
         if not self.robot_type:
-            found.append("it has no robot_type; give its name")
+            yield "it has no robot_type; give its name"
         if rows < PATCH or cols < PATCH or rows % PATCH or cols % PATCH or rows * cols > MAX_PIXELS:
-            found.append(
+            yield (
                 f"its depth image is {rows} x {cols}, expected multiples of {PATCH} and at most "
                 f"{MAX_PIXELS} pixels"
             )
         if not 0 < self.depth_max_m <= MAX_DEPTH_M:
-            found.append(f"depth_max_m is {self.depth_max_m}, expected 0 to {MAX_DEPTH_M} m")
+            yield f"depth_max_m is {self.depth_max_m}, expected 0 to {MAX_DEPTH_M} m"
         if not 1 <= self.planner_hz <= MAX_HZ:
-            found.append(f"planner_hz is {self.planner_hz}, expected 1 to {MAX_HZ}")
+            yield f"planner_hz is {self.planner_hz}, expected 1 to {MAX_HZ}"
         for what, names, most in (
             ("state_names", self.state_names, MAX_STATE),
             ("action_names", self.action_names, MAX_ACTIONS),
         ):
             if not 1 < len(names) <= most or len(set(names)) < len(names) or not all(names):
-                found.append(f"{what} are {len(names)} names, expected 2 to {most}, all different")
-        found += _box_problems(self.action_box, len(self.action_names))
-        if self.mirror is not None:
-            mirror = self.mirror
-            for what, source, sign, size in (
-                ("state", mirror.state_source, mirror.state_sign, len(self.state_names)),
-                ("action", mirror.action_source, mirror.action_sign, len(self.action_names)),
-            ):
-                if not _is_reflection(source, sign, size):
-                    found.append(
-                        f"the mirror of the {what} is no reflection: applied twice to {size} "
-                        "values it must give them back"
-                    )
-        return found
+                yield f"{what} are {len(names)} names, expected 2 to {most}, all different"
+        size = self.action_dim
+        if not _is_ascending(self.action_box, size):
+            yield f"its action_box is not low < neutral < high for each of {size} actions"
+        if self.mirror is None:
+            return
+        for what, source, sign, size in (
+            ("state", self.mirror.state_source, self.mirror.state_sign, self.state_dim),
+            ("action", self.mirror.action_source, self.mirror.action_sign, self.action_dim),
+        ):
+            if not _is_reflection(source, sign, size):
+                yield (
+                    f"the mirror of the {what} is no reflection: applied twice to {size} "
+                    "values it must give them back"
+                )
 
     @property
     def state_dim(self) -> int:
@@ -190,18 +190,14 @@ class RobotSpec:
         return decode(RobotSpec, options, ROBOT_KEY)
 
 
-def _box_problems(box: spec.ActionBox, size: int) -> list[str]:
+def _is_ascending(box: spec.ActionBox, size: int) -> bool:
+    """Whether low < neutral < high are ``size`` finite numbers each."""
     try:
         values = np.array([box.low, box.neutral, box.high], np.float64)
     except (TypeError, ValueError):
-        values = np.zeros((0, 0))
-    if (
-        values.shape == (3, size)
-        and np.isfinite(values).all()
-        and (np.diff(values, axis=0) > 0).all()
-    ):
-        return []
-    return [f"its action_box is not low < neutral < high for each of {size} actions"]
+        return False
+    finite = values.shape == (3, size) and np.isfinite(values).all()
+    return bool(finite and (np.diff(values, axis=0) > 0).all())
 
 
 def _is_reflection(source: Sequence[int], sign: Sequence[float], size: int) -> bool:

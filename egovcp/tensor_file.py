@@ -1,31 +1,21 @@
-"""Reads the headers of untrusted safetensors files, before `safetensors` loads the tensors.
-
-The header holds dtype, shape and byte range of every tensor; `safetensors` checks the ranges.
-"""
+"""Reads untrusted safetensors files."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.decode import DecodeError, decode, require_type, shown
+from safetensors import SafetensorError, deserialize
+
+from egovcp.decode import shown
 from egovcp.files import UnsafeFileError, parse_json, read_bytes
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
+"""Allowance for the header in the size limit of a file."""
 _LENGTH_BYTES: Final = 8  # of the header, a little-endian integer before it
-_METADATA: Final = "__metadata__"
-_HEADER_DEPTH: Final = 4
-
-
-@dataclass(frozen=True)
-class TensorInfo:
-    """A tensor in the header."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    data_offsets: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -33,7 +23,9 @@ class TensorFile:
     """A safetensors file in memory."""
 
     metadata: Mapping[str, str]
-    tensors: Mapping[str, TensorInfo]
+    dtypes: Mapping[str, str]
+    """Tensor -> its dtype, ``"F32"``."""
+    shapes: Mapping[str, tuple[int, ...]]
     content: bytes
     """The whole file; `safetensors.numpy.load` and `safetensors.torch.load` take it."""
 
@@ -42,32 +34,20 @@ class TensorFile:
         """Parse a file in memory.
 
         Raises:
-            UnsafeFileError: the header is invalid.
+            UnsafeFileError: it is not a safetensors file.
         """
-        length = int.from_bytes(content[:_LENGTH_BYTES], "little")
-        start = _LENGTH_BYTES + length
-        if len(content) < _LENGTH_BYTES or start > len(content):
-            raise UnsafeFileError("not a safetensors file, or truncated")
-        if length > HEADER_LIMIT_BYTES:
-            raise UnsafeFileError(
-                f"its header has {length} bytes, expected at most {HEADER_LIMIT_BYTES}"
-            )
         try:
-            text = content[_LENGTH_BYTES:start].decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise UnsafeFileError("its header is not UTF-8") from error
-        header = parse_json(text, limit_depth=_HEADER_DEPTH)
-        try:
-            require_type(header, dict[str, Any], "the header")
-            metadata = header.pop(_METADATA, {})
-            require_type(metadata, dict[str, str], _METADATA)
-            tensors = {
-                name: decode(TensorInfo, value, f"tensor {shown(name)}")
-                for name, value in header.items()
-            }
-        except DecodeError as error:
-            raise UnsafeFileError(str(error)) from error
-        return cls(metadata, tensors, content)
+            tensors = dict(deserialize(content))  # type: ignore[no-untyped-call]
+        except SafetensorError as error:
+            raise UnsafeFileError(f"not a safetensors file, or truncated: {error}") from error
+        end = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
+        header = json.loads(content[_LENGTH_BYTES:end])  # `deserialize` has checked it
+        return cls(
+            metadata=header.get("__metadata__", {}),
+            dtypes={name: tensor["dtype"] for name, tensor in tensors.items()},
+            shapes={name: tuple(tensor["shape"]) for name, tensor in tensors.items()},
+            content=content,
+        )
 
     def json_metadata(self, key: str) -> Any:
         """The JSON value in the metadata under ``key``.
@@ -82,31 +62,26 @@ class TensorFile:
     def require(
         self, shapes: Mapping[str, tuple[int, ...]], dtypes: Collection[str] = ("F32",)
     ) -> None:
-        """Raise `UnsafeFileError` unless the file holds exactly these tensors.
-
-        Args:
-            shapes: name -> shape.
-            dtypes: allowed dtypes.
-        """
+        """Raise `UnsafeFileError` unless the file holds exactly these tensors."""
         self.require_names(shapes, dtypes)
-        for name, info in self.tensors.items():
-            if info.shape != shapes[name]:
+        for name, shape in self.shapes.items():
+            if shape != shapes[name]:
                 raise UnsafeFileError(
-                    f"tensor {name} has shape {list(info.shape)}, expected {list(shapes[name])}"
+                    f"tensor {name} has shape {list(shape)}, expected {list(shapes[name])}"
                 )
 
     def require_names(self, names: Collection[str], dtypes: Collection[str] = ("F32",)) -> None:
         """As `require`, for any shape."""
-        missing = [name for name in names if name not in self.tensors]
-        unknown = [name for name in self.tensors if name not in names]
+        missing = [name for name in names if name not in self.shapes]
+        unknown = [name for name in self.shapes if name not in names]
         if missing:
             raise UnsafeFileError(f"tensor {missing[0]} is missing")
         if unknown:
             raise UnsafeFileError(f"tensor {shown(unknown[0])} is unexpected")
-        for name, info in self.tensors.items():
-            if info.dtype not in dtypes:
+        for name, dtype in self.dtypes.items():
+            if dtype not in dtypes:
                 raise UnsafeFileError(
-                    f"tensor {name} has dtype {info.dtype}, expected {' or '.join(dtypes)}"
+                    f"tensor {name} has dtype {dtype}, expected {' or '.join(dtypes)}"
                 )
 
 
@@ -114,7 +89,7 @@ def read_tensor_file(path: Path, limit_bytes: int) -> TensorFile:
     """Read a safetensors file of at most ``limit_bytes``.
 
     Raises:
-        UnsafeFileError: it is not a regular file, too large, or has an invalid header.
+        UnsafeFileError: it is not a regular file, too large, or not a safetensors file.
         OSError: it is missing, or cannot be read.
     """
     return TensorFile.parse(read_bytes(path, limit_bytes))

@@ -9,14 +9,15 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import secrets
 import stat
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.files import UnsafeFileError, read_bytes, removed_on_error, sync
 
 _WRITABLE_BY_OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
 _LARGEST_FILE: Final = 64 << 20
@@ -35,11 +36,11 @@ def user_cache_folder() -> Path | None:
 
 
 class TrustedCache:
-    """An open cache folder, created with mode 0700 if it is missing.
+    """A cache folder, created with mode 0700 if it is missing.
 
     Raises:
         EnvironmentFailure: another user owns it or can write to it, or it is a symbolic link.
-        OSError: it cannot be created or opened.
+        OSError: it cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -51,30 +52,16 @@ class TrustedCache:
                 "set XDG_CACHE_HOME to another folder"
             )
         for ancestor in _ancestors(folder):
-            _require_trusted(ancestor, ancestor.stat(), sticky=True)
-        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-        self._descriptor = os.open(folder, flags)
-        try:
-            _require_trusted(folder, os.fstat(self._descriptor), sticky=False)
-        except EnvironmentFailure:
-            self.close()
-            raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        os.close(self._descriptor)
+            _require_trusted(ancestor, sticky=True)
+        _require_trusted(folder, sticky=False)
 
     def read(self, name: str) -> bytes | None:
         """Content of a file; None if it is missing, not trusted, or does not match its digest."""
-        content, digest = self._read(name), self._read(_digest_name(name))
-        if content is None or digest is None or digest != _digest_line(name, content):
+        try:
+            content, digest = self._read(name), self._read(_digest_name(name))
+        except (OSError, UnsafeFileError):
             return None
-        return content
+        return content if digest == _digest_line(name, content) else None
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file and its digest durably and atomically.
@@ -84,35 +71,23 @@ class TrustedCache:
         """
         self._write(name, content)
         self._write(_digest_name(name), _digest_line(name, content))
-        os.fsync(self._descriptor)
+        sync(self.folder)
 
-    def _read(self, name: str) -> bytes | None:
-        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        try:
-            descriptor = os.open(name, flags, dir_fd=self._descriptor)
-        except OSError:
-            return None
-        with os.fdopen(descriptor, "rb") as file:
-            status = os.fstat(descriptor)
-            trusted = stat.S_ISREG(status.st_mode) and not _distrust(status)
-            if not trusted or status.st_size > _LARGEST_FILE:
-                return None
-            return file.read()
+    def _read(self, name: str) -> bytes:
+        path = self.folder / name
+        if path.is_symlink() or _distrust(path.stat()):
+            raise UnsafeFileError("not trusted")
+        return read_bytes(path, _LARGEST_FILE)
 
     def _write(self, name: str, content: bytes) -> None:
-        temporary = f".{name}.{secrets.token_hex(8)}"
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-        descriptor = os.open(temporary, flags, 0o600, dir_fd=self._descriptor)
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(descriptor)
-            os.rename(temporary, name, src_dir_fd=self._descriptor, dst_dir_fd=self._descriptor)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(temporary, dir_fd=self._descriptor)
-            raise
+        with (
+            tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file,  # mode 0600
+            removed_on_error(Path(file.name)) as temporary,
+        ):
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            os.rename(temporary, self.folder / name)
 
 
 def load_library(content: bytes, name: str) -> ctypes.CDLL:
@@ -163,8 +138,8 @@ def _distrust(status: os.stat_result, sticky: bool = False) -> str:
     return ""
 
 
-def _require_trusted(path: Path, status: os.stat_result, sticky: bool) -> None:
-    if reason := _distrust(status, sticky):
+def _require_trusted(path: Path, sticky: bool) -> None:
+    if reason := _distrust(path.stat(), sticky):
         remedy = f"chmod go-w {path}, or " if "written" in reason else ""
         raise EnvironmentFailure(
             f"the cache folder is not safe to load code from: {path} {reason}; {remedy}set "

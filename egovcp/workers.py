@@ -39,7 +39,6 @@ def stop_on_signal(
     KeyboardInterrupt.
 
     Args:
-        signals: which signals.
         interrupt: whether a second signal raises KeyboardInterrupt; else it is added to the list.
     """
     received: list[int] = []

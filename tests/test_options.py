@@ -25,7 +25,7 @@ CONFIGS = {
     "egovcp-eval-model": "egovcp_train.heldout.command:HeldoutConfig",
     "egovcp-train-lowlevel": "egovcp_train.lowlevel.train:LowLevelTrainConfig",
     "egovcp-eval-lowlevel": "egovcp_train.lowlevel.evaluate:LowLevelEvalConfig",
-    "egovcp-train-ppo": "egovcp_train.ppo.config:PpoTrainConfig",
+    "egovcp-train-ppo": "egovcp_train.ppo.train:PpoTrainConfig",
     "egovcp-deploy": "egovcp_deploy.config:DeployConfig",
     "egovcp-demo": "egovcp_deploy.demo:DemoConfig",
     "egovcp-eval": "egovcp_deploy.evaluate:EvalConfig",

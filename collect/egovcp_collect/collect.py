@@ -14,16 +14,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 from tqdm import tqdm
 
-from egovcp import spec
 from egovcp.cli import preset_defaults, run_command
-from egovcp.data import tiff
 from egovcp.data.committer import Committer, open_committer
+from egovcp.data.episode import frame_layout
 from egovcp.data.source import local_root
 from egovcp.errors import EnvironmentFailure
 from egovcp.hardware import available_cores
-from egovcp.robot_spec import G1
+from egovcp.robot_spec import RobotSpec
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
@@ -32,22 +32,15 @@ from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_collect.provenance import make_provenance, require_compatible
-from egovcp_collect.worker_pool import WorkerPool
-from egovcp_collect.workers import Worker
+from egovcp_collect.worker_pool import Worker, WorkerPool
 
 PROG: Final = "egovcp-collect"
 _EPILOG: Final = (
     "Every finished episode is stored on the disk at once. After an interruption the same command "
     "with --resume continues; with more --episodes it extends the dataset."
 )
-STAGED_FRAME_BYTES: Final = (
-    len(tiff.header(spec.DEPTH_ROWS, spec.DEPTH_COLS))
-    + 2 * spec.DEPTH_ROWS * spec.DEPTH_COLS
-    + 4 * (spec.STATE_DIM + spec.ACTION_DIM + 1 + len(spec.REWARD_TERMS) + spec.OBJECT_DIM)
-)
-"""Bytes of a frame of the G1 in a staged episode, which is not compressed."""
 MIN_COMPRESSED_SHARE: Final = 0.2
-"""Lower bound of the compressed size of a frame as a share of `STAGED_FRAME_BYTES`."""
+"""Lower bound of the compressed size of a frame as a share of `frame_bytes`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,7 +78,8 @@ def collect(config: CollectConfig, command: str = "") -> None:
     root = local_root(config.dataset)
     with open_committer(root, provenance, config.shard_episodes, check_existing) as committer:
         missing = _missing_scenarios(config, committer)
-        require_disk_space(committer.root.parent, missing, config.env, config.shard_episodes)
+        if missing:
+            require_disk_space(committer.root.parent, missing, config.env, config.shard_episodes)
         began = time.monotonic()
         with tqdm(
             total=config.episodes,
@@ -126,14 +120,17 @@ def _missing_scenarios(config: CollectConfig, committer: Committer) -> list[Scen
     return [scenario for scenario in through.scenarios() if scenario.episode in numbers]
 
 
+def frame_bytes(robot: RobotSpec) -> int:
+    """Bytes of the arrays of a frame."""
+    layout = frame_layout(robot).values()
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout)
+
+
 def min_bytes(scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int) -> int:
     """Lower bound of the bytes that the episodes take, with one shard of them uncompressed."""
     ticks = [env.episode(scenario.task).ticks for scenario in scenarios]
-    uncompressed = sum(ticks[:shard_episodes])
-    share, frame = MIN_COMPRESSED_SHARE, STAGED_FRAME_BYTES
-    if scenarios:
-        robot = find_task(scenarios[0].task).robot_spec()
-        frame += 2 * (math.prod(robot.depth) - math.prod(G1.depth))
+    uncompressed, share = sum(ticks[:shard_episodes]), MIN_COMPRESSED_SHARE
+    frame = frame_bytes(find_task(scenarios[0].task).robot_spec())
     return round(frame * (share * sum(ticks) + (1 - share) * uncompressed))
 
 

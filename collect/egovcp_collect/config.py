@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import bounded, check_bounds, require_cores
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
 from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
@@ -42,7 +42,7 @@ class CollectConfig:
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
     """Episode i depends on (seed, i) only, not on the number of workers."""
-    num_workers: int = bounded(0, least=0, most=65_536)
+    num_workers: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """Simulation processes; 0: one per processor core."""
     worker_timeout: float = bounded(120.0, least=1)
     """Replace a worker that sends no report for this long, s."""
@@ -64,7 +64,6 @@ class CollectConfig:
         check_bounds(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
-        require_cores("--num_workers", self.num_workers)
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes)
         require_memory_for_robots("--num_envs", self.num_envs, robots)

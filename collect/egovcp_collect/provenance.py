@@ -13,7 +13,7 @@ from egovcp.errors import UsageError
 from egovcp.flags import merged
 from egovcp.packages import versions_of
 from egovcp.sim.robot_env import controller_id_of
-from egovcp.sim.tasks.registry import ALL_TASKS, task_names
+from egovcp.sim.tasks.registry import ALL_TASKS
 from egovcp.values import differences
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
 
@@ -55,10 +55,7 @@ def _migrated(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require_compatible(now: Provenance, before: Provenance) -> None:
-    """Raise `UsageError` unless both collections have the same settings and package versions.
-
-    Differences in options of tasks that neither collects are shown only if there are no others.
-    """
+    """Raise `UsageError` unless both collections have the same settings and package versions."""
     if before.seed is None:  # `egovcp-collect` always records one
         raise UsageError(
             "--resume continues a dataset that egovcp-collect began, and this one was merged or "
@@ -75,27 +72,17 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
         **dict(differences(_migrated(before.config), _migrated(now.config), "--")),
         **dict(differences(before_versions, now_versions, "version of ")),
     }
-    changed = {
-        name: f"{name} was {old}, is {new}"
+    changed = [
+        f"{name} was {old}, is {new}"
         for name, (old, new) in settings.items()
         # controllers are compared by id: a file of another name may hold the same one
         if name != "--env.controller" and old != new
-    }
-    unused = _unused_prefixes(before, now)
-    used = [text for name, text in changed.items() if not name.startswith(unused)]
-    shown = used or list(changed.values())
-    if shown:
-        omitted = len(shown) - _SHOWN_DIFFERENCES
+    ]
+    if changed:
+        omitted = len(changed) - _SHOWN_DIFFERENCES
         more = f", and {omitted} more" if omitted > 0 else ""
         raise UsageError(
             "--resume would add episodes of other settings: "
-            f"{'; '.join(shown[:_SHOWN_DIFFERENCES])}{more}; use the settings of the dataset, or "
+            f"{'; '.join(changed[:_SHOWN_DIFFERENCES])}{more}; use the settings of the dataset, or "
             "another --dataset.root"
         )
-
-
-def _unused_prefixes(*collections: Provenance) -> tuple[str, ...]:
-    """Prefixes of the options of tasks that none of the collections has."""
-    used = {task for c in collections for task in _migrated(c.config)["task"].split(",")}
-    unused = [task for task in task_names() if task not in used]
-    return tuple(f"--env.{task}{end}" for task in unused for end in (".", "_episode."))

@@ -1,4 +1,4 @@
-"""Runs episodes on a pool of workers until all are finished.
+"""Runs episodes on a pool of processes until all are finished.
 
 A worker that dies or stops reporting is replaced, and its unfinished episodes are simulated again.
 An episode depends on its scenario only, so the data do not depend on replacements.
@@ -6,28 +6,40 @@ An episode depends on its scenario only, so the data do not depend on replacemen
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import pickle
 import time
+import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from multiprocessing.connection import wait
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Final
 
-from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.data import Episode
+from egovcp.data.staging import StagingDir, encode
+from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.workers import Worker, WorkerReport
+from egovcp.workers import inherited_by_workers
+from egovcp_collect.config import CollectConfig
+from egovcp_collect.simulation import Simulation
 
 MAX_ATTEMPTS: Final = 3
 """How many workers may die on the same episode before the collection stops."""
 _POLL_S: Final = 0.25
+_REPORT_S: Final = 0.25
+_MAX_PENDING: Final = 32  # episodes in memory that wait for the disk
 
 
 class WorkerPool:
     """Assigns episodes to workers, and replaces workers that are lost.
 
     Args:
-        start: starts a worker.
-        workers: how many to start.
         num_envs: episodes that each worker simulates in parallel.
         timeout: seconds without a report after which a worker is replaced.
     """
@@ -47,7 +59,6 @@ class WorkerPool:
         self._count = max(1, min(workers, -(-len(self._waiting) // num_envs)))
         self._workers: list[Worker] = []
         self._lost: Counter[int] = Counter()
-        self._invalid: Counter[int] = Counter()
 
     @property
     def done(self) -> bool:
@@ -64,9 +75,8 @@ class WorkerPool:
         """Start missing workers, wait briefly for reports, and assign waiting episodes.
 
         Raises:
-            DataError: an episode was invalid twice.
             EnvironmentFailure: an episode ended its worker `MAX_ATTEMPTS` times.
-            Exception: any other error of a worker, such as a full disk.
+            Exception: an error of a worker, such as a full disk or an invalid episode.
         """
         while len(self._workers) < self._count:
             self._start_worker()
@@ -84,45 +94,29 @@ class WorkerPool:
             for number in report.finished:
                 worker.unfinished.pop(number, None)
             if report.error is not None:
-                self._replace(worker, report.error)
-                return reports
+                raise report.error
         if not alive:
-            self._replace(worker, None)
+            self._replace(worker, "was killed (out of memory? try fewer --num_workers)")
         elif worker.unfinished and time.monotonic() - worker.last_report > self._timeout:
-            self._replace(worker, TimeoutError(f"sent no report for {self._timeout:.0f} s"))
+            self._replace(worker, f"sent no report for {self._timeout:.0f} s")
         return reports
 
-    def _replace(self, worker: Worker, cause: Exception | None) -> None:
-        """End a worker; its unfinished episodes go to the front of the queue."""
+    def _replace(self, worker: Worker, reason: str) -> None:
+        """End a worker; its unfinished episodes go to the front of the queue.
+
+        Raises if one of them has ended `MAX_ATTEMPTS` workers.
+        """
         worker.kill()
         self._workers.remove(worker)
-        if isinstance(cause, DataError):
-            self._count_invalid(worker, cause)
-        elif cause is None or isinstance(cause, TimeoutError):
-            self._count_lost(worker, cause)
-        else:
-            raise cause
-        self._waiting.extendleft(reversed(worker.unfinished.values()))
-
-    def _count_invalid(self, worker: Worker, cause: DataError) -> None:
-        """Raise at the second invalid result of an episode. All unfinished episodes of the worker
-        count if the error does not name one."""
-        suspects = [n for n in worker.unfinished if cause.episode in (None, n)]
-        self._invalid.update(suspects)
-        if not suspects or max(self._invalid[number] for number in suspects) > 1:
-            raise cause
-
-    def _count_lost(self, worker: Worker, cause: Exception | None) -> None:
-        """Raise if an episode of the worker has ended `MAX_ATTEMPTS` workers."""
         self._lost.update(worker.unfinished.keys())
         attempts = max((self._lost[number] for number in worker.unfinished), default=0)
         if attempts >= MAX_ATTEMPTS:
             first, last = min(worker.unfinished), max(worker.unfinished)
-            reason = str(cause) if cause else "was killed (out of memory? try fewer --num_workers)"
             raise EnvironmentFailure(
                 f"a worker {reason}, {attempts} times in a row, while it simulated episodes "
                 f"{first} to {last}"
             )
+        self._waiting.extendleft(reversed(worker.unfinished.values()))
 
     def _start_worker(self) -> None:
         """Start a worker with an equal share of the waiting episodes."""
@@ -146,3 +140,102 @@ class WorkerPool:
                 worker.last_report = time.monotonic()  # an idle worker sends no reports
             worker.unfinished.update({scenario.episode: scenario for scenario in scenarios})
             worker.assign(scenarios)
+
+
+@dataclass(frozen=True)
+class WorkerReport:
+    """What a worker did since its last report."""
+
+    steps: int
+    """Planner ticks."""
+    finished: tuple[int, ...] = ()
+    """Numbers of the episodes that it finished."""
+    error: Exception | None = None
+    """The error that ended the worker; this is its last report."""
+
+
+def picklable(error: Exception) -> Exception:
+    """The error, or a `RuntimeError` with its message if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - bytes made in this expression
+    except Exception:  # noqa: BLE001 - an exception class may raise anything here
+        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
+    return error
+
+
+class Worker:
+    """A process that stages its episodes on the disk itself; reports come through a pipe."""
+
+    def __init__(self, config: CollectConfig, staging: Path) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, remote = context.Pipe()
+        self.process = context.Process(
+            target=_run_worker, args=(remote, config, staging, os.getpid()), daemon=True
+        )
+        with inherited_by_workers():
+            self.process.start()
+        remote.close()
+        self.last_report = time.monotonic()
+        self.unfinished: dict[int, Scenario] = {}
+        """Its episodes by number."""
+
+    @property
+    def waitables(self) -> list[Connection | int]:
+        """What `multiprocessing.connection.wait` returns on a report, or on the worker's death."""
+        return [self.pipe, self.process.sentinel]
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Append episodes to its queue."""
+        try:
+            self.pipe.send(list(scenarios))
+        except OSError:  # the process is dying; the pool assigns the episodes again
+            self.process.join(timeout=1)
+
+    def poll(self) -> list[WorkerReport]:
+        """Reports since the last call; does not block."""
+        reports: list[WorkerReport] = []
+        try:
+            while self.pipe.poll():
+                reports.append(self.pipe.recv())
+        except (EOFError, OSError, pickle.UnpicklingError):
+            self.process.join(timeout=1)
+        return reports
+
+    @property
+    def alive(self) -> bool:
+        """Whether more reports can follow."""
+        return self.process.is_alive()
+
+    def kill(self) -> None:
+        """End it immediately; returns when it has ended."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: int) -> None:
+    """Body of the process; it ends with the pipe or with the parent."""
+    try:
+        simulation, stage = Simulation(config), partial(_stage, StagingDir(staging))
+        disk = ThreadPoolExecutor(1)  # so that the simulation does not wait for the disk
+        pending: deque[Future[int]] = deque()
+        while os.getppid() == parent:
+            while pipe.poll(None if simulation.idle else 0):  # an idle worker blocks here
+                simulation.add(pipe.recv())
+            steps, episodes = simulation.run(_REPORT_S)
+            pending.extend(disk.submit(stage, *episode) for episode in episodes)
+            finished: list[int] = []
+            while pending and (simulation.idle or len(pending) > _MAX_PENDING or pending[0].done()):
+                finished.append(pending.popleft().result())
+            pipe.send(WorkerReport(steps, tuple(finished)))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception as error:  # noqa: BLE001 - every error is reported to the collection
+        error.add_note(traceback.format_exc())
+        pipe.send(WorkerReport(0, error=picklable(error)))
+
+
+def _stage(staging: StagingDir, number: int, episode: Episode) -> int:
+    """Write an episode to the disk; returns its number."""
+    staging.put(number, encode(episode, f"episode {number}"))
+    return number

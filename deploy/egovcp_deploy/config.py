@@ -10,32 +10,9 @@ from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.tasks.registry import DEFAULT_TASK
-from egovcp_deploy.live.hardware import CameraOptions
+from egovcp_deploy.live.hardware import RobotOptions
 from egovcp_deploy.options import SEEDS, encoded
-from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
-from egovcp_deploy.robots.bridge import BridgeConfig
-
-
-@dataclass(frozen=True)
-class RobotOptions:
-    """The robot."""
-
-    type: Literal["sim", "unitree_g1", "replay"] = "sim"
-    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
-    behind LeRobot's bridge, on the wall clock. replay: recorded observations; the policy plans
-    again, and nothing is driven."""
-    recordings: str = ""
-    """For replay: an MCAP file, or a folder of them."""
-    controller: str = "walk"
-    """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; it must be
-    that of the policy's data. The simulated robot uses --env.controller."""
-    bridge: BridgeConfig = field(default_factory=BridgeConfig)
-    """Address of the bridge of a unitree_g1."""
-    camera: CameraOptions = field(default_factory=CameraOptions)
-    """The depth camera of a unitree_g1."""
-    limits: Limits = field(default_factory=Limits)
-    """When the robot is held, and when its motors are damped."""
 
 
 @dataclass(frozen=True)

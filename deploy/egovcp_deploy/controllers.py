@@ -21,7 +21,6 @@ from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import SEARCH, Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
-from egovcp.terminal import echo
 from egovcp.values import differences
 from egovcp_deploy.options import PLANNER
 from egovcp_deploy.scores import EpisodeScore, eval_scores
@@ -115,13 +114,12 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
 
 def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestConstant]:
     """Task -> result, from the ``constant.json`` of an earlier evaluation in the same ``setting``
-    (controller and environment); one of an older version has none: a note is printed. Raises
-    `DataError` if it is missing or of another format, `UsageError` if the settings differ."""
+    (controller and environment). Raises `DataError` if it is missing or of another format,
+    `UsageError` if the settings differ."""
     try:
         content = read_json(path)
-        entries = content.get("constants", content)
-        constants = {task: _parse(task, entry) for task, entry in entries.items()}
-        known = {} if entries is content else {name: content[name] for name in setting}
+        constants = {task: _parse(task, entry) for task, entry in content["constants"].items()}
+        known = {name: content.get(name) for name in setting}
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"cannot read --constant.path={path}: {reason}") from error
@@ -129,10 +127,8 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
         raise DataError(
             f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"
         ) from error
-    if not known:
-        echo(f"--constant.path={path} names no controller and environment: used unchecked")
     for name, (old, new) in differences(known, setting):
-        if old is not None:  # None: an option of a later version
+        if old is not None:  # None: unknown, as an option of a later version
             raise UsageError(
                 f"--constant.path={path} was found with {name}={as_flag_value(old)}, expected "
                 f"{as_flag_value(new)}; omit --constant.path to search the best action again"

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -22,11 +22,10 @@ from egovcp.hardware import available_cores
 from egovcp.log.picture import AHEAD, PictureSink
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.plan import Policy, PolicyStep, blank_observation
-from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
+from egovcp.policy_options import load_policy
 from egovcp.rate import NS_PER_S
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.base_env import BaseVectorEnv, Observation
-from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
@@ -37,18 +36,10 @@ from egovcp_deploy.pilot.planner import RolloutPolicy
 from egovcp_deploy.robots.sim import true_poses
 from egovcp_deploy.scores import EpisodeScore
 
+if TYPE_CHECKING:
+    from egovcp_deploy.evaluate import EvalConfig
+
 _POLL_S: Final = 0.2
-
-
-@dataclass(frozen=True)
-class EpisodeSetup:
-    """Options that all groups share; sent to each worker once."""
-
-    env: EnvConfig
-    policy: PolicyOptions = field(default_factory=PolicyOptions)  # of the controller `planner`
-    planner: PlannerOptions = field(default_factory=PlannerOptions)
-    seed: int = 0
-    ppo: str = ""  # file of the controller `ppo`
 
 
 @dataclass(frozen=True)
@@ -64,8 +55,8 @@ class EpisodeGroup:
 class EpisodePlayer:
     """Plays groups in this process; groups of equal size share environment and policy."""
 
-    def __init__(self, setup: EpisodeSetup, artifact: Artifact | None = None) -> None:
-        self._setup = setup
+    def __init__(self, config: EvalConfig, artifact: Artifact | None = None) -> None:
+        self._config = config
         self._artifact = artifact
         self._envs: dict[int, BaseVectorEnv] = {}
         self._policies: dict[tuple[str, int], RolloutPolicy] = {}
@@ -78,12 +69,12 @@ class EpisodePlayer:
             return []
         size, task = len(group.scenarios), group.scenarios[0].task
         if size not in self._envs:
-            self._envs[size] = make_env(self._setup.env, size, [task])
+            self._envs[size] = make_env(self._config.env, size, [task])
         env = self._envs[size]
         return play(env, self._policy(group, env), group.scenarios, stopped, group.videos)
 
     def _policy(self, group: EpisodeGroup, env: BaseVectorEnv) -> RolloutPolicy:
-        setup, robots = self._setup, env.num_envs
+        config, robots = self._config, env.num_envs
         if group.controller not in (PPO, PLANNER):
             scripted = reference(group.controller, group.action)
             return ReferencePolicy(scripted, env, lambda: group.scenarios)
@@ -91,10 +82,10 @@ class EpisodePlayer:
         if key not in self._policies:
             learned: RolloutPolicy
             if group.controller == PPO:
-                learned = ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
+                learned = ReactivePolicy(ReactiveNetwork.load(Path(config.ppo.path)), robots)
             else:
-                self._artifact = self._artifact or load_policy(setup.policy, setup.planner)
-                learned = self._artifact.make_policy(robots, setup.seed)
+                self._artifact = self._artifact or load_policy(config.policy, config.planner)
+                learned = self._artifact.make_policy(robots, config.seed)
             for _ in range(2):  # the first calls compile and allocate, and must not be timed
                 learned.act(*blank_observation(robots, env.robot))
             self._policies[key] = learned
@@ -190,24 +181,23 @@ def _draw(
 
 
 class EpisodePool:
-    """Plays groups in worker processes that last until `close`. ``num_workers`` 1 plays in this
-    process, with ``artifact`` if it is loaded already; 0 starts one worker per processor core. Once
-    ``stopped()`` is true, episodes in progress are abandoned."""
+    """Plays groups in worker processes that last until `close`. One worker plays in this process,
+    with ``artifact`` if it is loaded already. Once ``stopped()`` is true, episodes in progress are
+    abandoned."""
 
     def __init__(
         self,
-        setup: EpisodeSetup,
-        num_workers: int = 0,
+        config: EvalConfig,
         artifact: Artifact | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._workers = num_workers or available_cores()
-        self._player = EpisodePlayer(setup, artifact)
+        self._workers = config.num_workers or available_cores()
+        self._player = EpisodePlayer(config, artifact)
         self._stopped = stopped
         context = multiprocessing.get_context("spawn")
         self._stop = context.Event()
         self._executor = ProcessPoolExecutor(  # starts no process before the first `submit`
-            self._workers, context, initializer=_start, initargs=(setup, self._stop)
+            self._workers, context, initializer=_start, initargs=(config, self._stop)
         )
 
     def play(self, groups: Sequence[EpisodeGroup]) -> Iterator[tuple[int, list[EpisodeScore]]]:
@@ -245,9 +235,9 @@ class _Worker:  # the state of a worker process
     stop: Event
 
 
-def _start(setup: EpisodeSetup, stop: Event) -> None:
+def _start(config: EvalConfig, stop: Event) -> None:
     torch.set_num_threads(1)
-    _Worker.player, _Worker.stop = EpisodePlayer(setup), stop
+    _Worker.player, _Worker.stop = EpisodePlayer(config), stop
 
 
 def _play(group: EpisodeGroup) -> list[EpisodeScore]:

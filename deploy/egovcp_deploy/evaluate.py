@@ -36,7 +36,7 @@ from egovcp_deploy.controllers import (
     load_constants,
     search_constant,
 )
-from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
+from egovcp_deploy.episodes import EpisodeGroup, EpisodePool
 from egovcp_deploy.options import (
     PLANNER,
     SEEDS,
@@ -176,14 +176,11 @@ def evaluate(config: EvalConfig) -> None:
         ppo = ReactiveNetwork.load(Path(config.ppo.path))
         ppo.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
-    setup = EpisodeSetup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
     scores: Scores = {task: {name: [] for name in config.controller_names} for task in config.tasks}
     try:
         with (
             stop_on_signal() as received,
-            closing(
-                EpisodePool(setup, config.num_workers, artifact, lambda: bool(received))
-            ) as pool,
+            closing(EpisodePool(config, artifact, lambda: bool(received))) as pool,
         ):
             if CONSTANT in config.controller_names:
                 constants = _find_constants(config, pool, constants)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
 from egovcp.packages import is_installed, versions_of
@@ -42,10 +42,7 @@ def check_output_dir(path: str) -> Path:
             f"--output_dir={path} holds {present[0]} already; results are never overwritten: "
             "name another folder or remove this one"
         )
-    try:
-        require_writable(folder)
-    except EnvironmentFailure as error:
-        raise EnvironmentFailure(f"cannot create {path}: {error}") from error
+    require_writable(folder)
     return folder
 
 

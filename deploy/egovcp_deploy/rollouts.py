@@ -163,7 +163,7 @@ def replay(config: DeployConfig, artifact: Artifact) -> Path:
     folder. Raises as `deploy`, and `DataError` for a damaged recording or another controller."""
     robot = open_recordings(Path(config.robot.recordings))
     artifact.require_controller(robot.controller_id)
-    config = replace(config, episodes=min(config.episodes, robot.count))
+    config = replace(config, episodes=min(config.episodes, len(robot.files)))
     return _play(config, artifact, robot, artifact.make_policy(1, config.seed))
 
 

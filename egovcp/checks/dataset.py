@@ -10,8 +10,8 @@ import numpy as np
 
 from egovcp import spec
 from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
-from egovcp.checks.feature_statistics import numbers_in
 from egovcp.checks.lerobot_dataset import STALE, LeRobotCheck, Progress, lerobot_problems
+from egovcp.checks.lerobot_episode import numbers_in
 from egovcp.data import DatasetReader, Episode, metadata, schema, stats
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
 from egovcp.data.metadata import hash_problems

@@ -17,17 +17,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from egovcp.checks.feature_statistics import (
+from egovcp.checks.lerobot_episode import (
     Statistics,
     camera_statistics_problems,
-    describe,
-    statistics_problems,
-)
-from egovcp.checks.lerobot_episode import (
     check_images,
     check_size,
+    describe,
     first_difference,
     span_problem,
+    statistics_problems,
     value_problems,
 )
 from egovcp.data import schema

@@ -65,22 +65,27 @@ def check_task(
     env = make_env(config or evaluation_config(), episodes, [name])
     scenarios = [Scenario(name, CHECK_SEED + seed, i) for i in range(episodes)]
     check_env(env, scenarios, _ENV_TICKS)
-    first, started = _Run(env, RandomWalk(), scenarios), time.perf_counter()
-    played = {"random": first.play()}
-    ms = 1e3 * (time.perf_counter() - started) / max(1, first.steps)
-    again = _Run(env, RandomWalk(), scenarios[::-1]).play()
+    started = time.perf_counter()
+    played = {"random": _play(env, RandomWalk(), scenarios)}
+    steps = sum(len(episode.arrays["reward"]) for episode in played["random"])
+    ms = 1e3 * (time.perf_counter() - started) / steps
+    again = _play(env, RandomWalk(), scenarios[::-1])
     for a, b in zip(played["random"], again[::-1], strict=True):
         _require_equal(name, a, b)
-    played["hold"] = _Run(env, Hold(), scenarios).play()
+    played["hold"] = _play(env, Hold(), scenarios)
     if kind.has_oracle():
-        played["oracle"] = _Run(env, Oracle(), scenarios).play()
+        played["oracle"] = _play(env, Oracle(), scenarios)
+    terms = env.instances[0].task.reward_terms
     env.close()
+    arrays = {n: [episode.arrays for episode in each] for n, each in played.items()}
     return TaskReport(
         task=name,
-        success_rate={n: float(np.mean([e.success for e in each])) for n, each in played.items()},
+        success_rate={
+            n: float(np.mean([a["success"][-1] for a in each])) for n, each in arrays.items()
+        },
         reward={
-            n: {term: float(np.mean([e.terms[term].sum() for e in each])) for term in each[0].terms}
-            for n, each in played.items()
+            n: {term: float(np.mean([a[f"term {term}"].sum() for a in each])) for term in terms}
+            for n, each in arrays.items()
         },
         ms_per_step=ms,
     )
@@ -92,78 +97,66 @@ class _Episode:
 
     number: int
     arrays: dict[str, NDArray[Any]]  # (T, ...)
-    terms: dict[str, NDArray[np.float64]]  # (T,) per reward term
     parameters: dict[str, float]
-    success: bool
 
 
-class _Run:
-    """Plays one episode in every row, and checks each step."""
-
-    def __init__(self, env: Any, policy: EnvPolicy, scenarios: Sequence[Any]) -> None:
-        self._env, self._policy, self._scenarios = env, policy, scenarios
-        self._task = scenarios[0].task
-        self.steps = 0
-
-    def play(self) -> list[_Episode]:
-        """The episodes in the order of the scenarios."""
-        env = self._env
-        env.reset(self._scenarios)
-        self._policy.reset(env, self._scenarios)
-        rows: list[list[dict[str, Any]]] = [[] for _ in self._scenarios]
-        success = [False] * len(rows)
-        while not env.done.all():
-            live = np.flatnonzero(~env.done).tolist()
-            result = env.step(self._policy.act(env))
-            objects = env.known_objects()
-            self.steps += len(live)
-            for row in live:
-                self._check(row, result)
-                rows[row].append(
-                    {
-                        "depth": result.observation.depth[row].copy(),
-                        "state": result.observation.state[row].copy(),
-                        "reward": result.reward[row],
-                        "success": result.success[row],
-                        "object": objects[row],
-                        **{f"term {n}": v[row] for n, v in result.reward_terms.items()},
-                    }
-                )
-                success[row] = bool(result.success[row])
-        return [
-            _Episode(
-                number=scenario.episode,
-                arrays={n: np.array([step[n] for step in steps]) for n in steps[0]},
-                terms={n: np.array([s[f"term {n}"] for s in steps]) for n in result.reward_terms},
-                parameters=env.parameters[row],
-                success=success[row],
+def _play(env: Any, policy: EnvPolicy, scenarios: Sequence[Any]) -> list[_Episode]:
+    """Play one episode in every row, check each step, and return the episodes in order."""
+    env.reset(scenarios)
+    policy.reset(env, scenarios)
+    rows: list[list[dict[str, Any]]] = [[] for _ in scenarios]
+    while not env.done.all():
+        live = np.flatnonzero(~env.done).tolist()
+        result = env.step(policy.act(env))
+        objects = env.known_objects()
+        for row in live:
+            _check(env.instances[row], row, result)
+            rows[row].append(
+                {
+                    "depth": result.observation.depth[row].copy(),
+                    "state": result.observation.state[row].copy(),
+                    "reward": result.reward[row],
+                    "success": result.success[row],
+                    "object": objects[row],
+                    **{f"term {n}": v[row] for n, v in result.reward_terms.items()},
+                }
             )
-            for row, (scenario, steps) in enumerate(zip(self._scenarios, rows, strict=True))
-        ]
+    return [
+        _Episode(
+            number=scenario.episode,
+            arrays={n: np.array([step[n] for step in steps]) for n in steps[0]},
+            parameters=env.parameters[row],
+        )
+        for row, (scenario, steps) in enumerate(zip(scenarios, rows, strict=True))
+    ]
 
-    def _check(self, row: int, result: Any) -> None:
-        from egovcp.sim.tasks.options import MAX_REWARD
 
-        instance = self._env.instances[row]
-        task = instance.task
-        where = f"episode {self._scenarios[row].episode}, {task.time:.2f} s"
-        for name, value in instance.parameters.items():
-            _require(np.isfinite(value), self._task, where, f"its parameter {name} is {value}")
-        for name, values in result.reward_terms.items():
-            found = f"reward term {name} is {values[row]}, expected at most {MAX_REWARD} in size"
-            _require(abs(values[row]) <= MAX_REWARD, self._task, where, found)
-        total = sum(values[row] for values in result.reward_terms.values())
-        differs = f"the reward is {result.reward[row]}, the sum of its terms {total}"
-        _require(np.isclose(total, result.reward[row]), self._task, where, differs)
-        if result.terminated[row]:
-            upright = f"the episode ended although the robot stands (success: {task.achieved})"
-            _require(_has_fallen(task), self._task, where, upright)
-        if result.truncated[row] and type(task).for_training:  # a sequence ends after its last part
-            early = f"the episode ended after {instance.tick} of {task.ticks_limit} ticks"
-            _require(instance.tick == task.ticks_limit, self._task, where, early)
-        place = task.state().position_w
-        numbers = np.shape(place) == (3,) and (np.isfinite(place).all() or np.isnan(place).all())
-        _require(numbers, self._task, where, f"the position of its object is {place}")
+def _check(instance: Any, row: int, result: Any) -> None:
+    """Raise `ConformanceError` if the step of an instance, a row of ``result``, is wrong."""
+    from egovcp.sim.tasks.options import MAX_REWARD
+
+    scenario, task = instance.scenario, instance.task
+
+    def require(ok: bool | np.bool_, problem: str) -> None:
+        if not ok:
+            raise ConformanceError(
+                f"task {scenario.task}, episode {scenario.episode}, {task.time:.2f} s: {problem}"
+            )
+
+    for name, value in instance.parameters.items():
+        require(np.isfinite(value), f"its parameter {name} is {value}")
+    for name, values in result.reward_terms.items():
+        found = f"reward term {name} is {values[row]}, expected at most {MAX_REWARD} in size"
+        require(abs(values[row]) <= MAX_REWARD, found)
+    if result.terminated[row]:
+        upright = f"the episode ended although the robot stands (success: {task.achieved})"
+        require(_has_fallen(task), upright)
+    if result.truncated[row] and type(task).for_training:  # a sequence ends after its last part
+        early = f"the episode ended after {instance.tick} of {task.ticks_limit} ticks"
+        require(instance.tick == task.ticks_limit, early)
+    place = task.object_w
+    numbers = np.shape(place) == (3,) and (np.isfinite(place).all() or np.isnan(place).all())
+    require(numbers, f"the position of its object is {place}")
 
 
 def _has_fallen(task: Any) -> bool:
@@ -188,8 +181,3 @@ def _require_equal(task: str, a: _Episode, b: _Episode) -> None:
                 "in a second run with the same actions; use scenario.rng and reset what __init__ "
                 "and place set"
             )
-
-
-def _require(ok: bool | np.bool_, task: str, where: str, problem: str) -> None:
-    if not ok:
-        raise ConformanceError(f"task {task}, {where}: {problem}")

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from egovcp import spec
-from egovcp.data import dataset_files, metadata, schema, stats
+from egovcp.data import metadata, schema, stats
 from egovcp.data.destination import (
     is_vacant,
     make_parent,
@@ -38,7 +38,7 @@ from egovcp.data.source import Source
 from egovcp.data.staging import EncodedEpisode, StagingDir, encode
 from egovcp.data.writer import VersionContents, VersionWriter, publish_version, recover, shard_paths
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
-from egovcp.files import removed_on_error
+from egovcp.files import write_json
 
 _STAGING: Final = "sealed"  # name on disk, which unfinished collections of older versions have
 
@@ -156,11 +156,7 @@ class Committer:
         self.staging.remove_invalid()
         self.staging.drop_before(self.next_number)
         self._staged = self.staging.numbers()
-        with removed_on_error(run.with_suffix(".partial")) as partial:
-            partial.unlink(missing_ok=True)
-            dataset_files.create_json(partial, asdict(self.provenance))
-            dataset_files.sync(partial)
-            dataset_files.rename(partial, run)
+        write_json(run, asdict(self.provenance))
 
 
 @contextmanager
@@ -174,7 +170,6 @@ def open_committer(
 
     Args:
         root: the dataset; a symbolic link is followed.
-        provenance: how it is collected.
         shard_episodes: episodes per shard of a new dataset; an existing one keeps its value.
         resume: called with the provenance of an existing dataset or unfinished collection; it
             raises if that cannot be continued. None: there must be none.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp import spec
-from egovcp.data import tiff
 from egovcp.data.episode import Episode
 from egovcp.data.features import Feature, values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
@@ -50,7 +49,6 @@ def convert_dataset(
     - Every episode counts as ended by its time limit. It has no success unless the dataset has.
 
     Args:
-        source: the dataset.
         features: name of the feature of some of `INPUTS`; the others have their usual names, and
             the image is that of the only camera.
         root: the new dataset; must be absent or an empty folder.
@@ -235,7 +233,7 @@ def _numbers(table: pa.Table, feature: Feature) -> NDArray[np.float64]:
     values = values_of(table[feature.key], feature).astype(np.float64)
     finite = np.isfinite(values).all(1)
     if not finite.all():
-        raise tiff.frame_error(int(np.argmin(finite)), f"{feature.key} is not finite")
+        raise DataError.without_place(f"{feature.key} is not finite", int(np.argmin(finite)))
     return values
 
 

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from egovcp.data import schema, tiff
-from egovcp.errors import SchemaError
+from egovcp.data import schema
+from egovcp.errors import DataError, SchemaError
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,13 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
         SchemaError: with `frame` set, shape or type differs from the feature's.
     """
     array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks)
     frames, levels, per_frame, key = len(array), 0, 1, feature.key
     while True:
         if isinstance(array, pa.ExtensionArray):
             array = array.storage
         if array.null_count:
             at = int(np.argmax(array.is_null().to_numpy(zero_copy_only=False)))
-            raise tiff.frame_error(at // per_frame, f"{key} is null")
+            raise DataError.without_place(f"{key} is null", at // per_frame)
         if not _is_list(array.type):
             break
         want = feature.shape[levels] if levels < len(feature.shape) else 0
@@ -92,14 +90,14 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
             given = f"{sizes[at]} values" if not levels else f"{sizes[at]} values at level {levels}"
             problem = f"{key} has {given}, but {schema.INFO_PATH} gives its shape as "
             problem += str(list(feature.shape))
-            raise tiff.frame_error(at // per_frame, problem, SchemaError)
+            raise SchemaError.without_place(problem, at // per_frame)
         per_frame, levels, array = per_frame * want, levels + 1, array.flatten()
     if levels != len(feature.shape) and (levels, feature.size) != (0, 1):
         problem = f"{key} holds single values, but its shape is {list(feature.shape)}"
-        raise tiff.frame_error(0, problem, SchemaError)
+        raise SchemaError.without_place(problem, 0)
     if _kind(array.type) != _kind_of(feature.dtype):
         problem = f"{key} holds {array.type}, but its dtype is {feature.dtype}"
-        raise tiff.frame_error(0, problem, SchemaError)
+        raise SchemaError.without_place(problem, 0)
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(frames, per_frame)
 
 

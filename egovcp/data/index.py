@@ -36,18 +36,16 @@ RULE: Final = (
 )
 
 
-def in_split(
-    identities: Sequence[str], split: str, fraction: float = HELDOUT_FRACTION
-) -> list[bool]:
+def in_split(identities: Sequence[str], split: str) -> list[bool]:
     """Whether each of the episodes with these identities belongs to ``split`` (see `RULE`)."""
     if split not in SPLITS:
         raise UsageError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     if split == "all":
         return [True] * len(identities)
     hashes = [_hash_fraction(identity) for identity in identities]
-    bound, lowest = fraction, min(hashes)
-    if lowest >= fraction > 0:
-        bound = min((value for value in hashes if value > lowest), default=fraction)
+    bound, lowest = HELDOUT_FRACTION, min(hashes)
+    if lowest >= bound:
+        bound = min((value for value in hashes if value > lowest), default=bound)
     return [(value < bound) == (split == "heldout") for value in hashes]
 
 
@@ -68,12 +66,7 @@ class EpisodeIndex:
     """(E,) number of each episode in its dataset."""
 
     @classmethod
-    def of(
-        cls,
-        readers: Sequence[DatasetReader],
-        split: str = "all",
-        heldout_fraction: float = HELDOUT_FRACTION,
-    ) -> Self:
+    def of(cls, readers: Sequence[DatasetReader], split: str = "all") -> Self:
         """The selected episodes of the datasets that belong to a split.
 
         Raises `DataError` if the datasets cannot be mixed, or the split is empty.
@@ -81,7 +74,7 @@ class EpisodeIndex:
         require_mixable(readers)
         places = [(d, i) for d, reader in enumerate(readers) for i in reader.selected.tolist()]
         identities = [readers[d].identity(i) for d, i in places]
-        chosen = list(compress(places, in_split(identities, split, heldout_fraction)))
+        chosen = list(compress(places, in_split(identities, split)))
         if not chosen:
             raise DataError(
                 f"none of the {len(places)} episodes falls into split {split!r}: collect more, or "
@@ -217,18 +210,16 @@ def require_mixable(readers: Sequence[DatasetReader]) -> None:
                 )
 
 
-def describe_heldout(
-    readers: Sequence[DatasetReader], fraction: float = HELDOUT_FRACTION
-) -> dict[str, Any]:
+def describe_heldout(readers: Sequence[DatasetReader]) -> dict[str, Any]:
     """JSON-compatible description of the held-out episodes; raises `DataError` if none is.
 
     ``numbers`` lists them for each dataset, or is null if they are more than `MAX_LISTED`.
     """
-    heldout = EpisodeIndex.of(readers, "heldout", fraction)
+    heldout = EpisodeIndex.of(readers, "heldout")
     numbers = [heldout.number[heldout.dataset == d].tolist() for d in range(len(readers))]
     return {
         "rule": RULE,
-        "fraction": fraction,
+        "fraction": HELDOUT_FRACTION,
         "count": len(heldout),
         "fingerprint": heldout.fingerprint,
         "numbers": numbers if len(heldout) <= MAX_LISTED else None,

@@ -13,12 +13,12 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import schema, tiff
+from egovcp.data.features import parse_feature, values_of
 from egovcp.data.paths import require_file
 from egovcp.errors import DataError
 from egovcp.files import require_regular
@@ -171,20 +171,7 @@ def present_columns(names: Iterable[str], found: Container[str]) -> list[str]:
 
 def to_numpy(column: pa.ChunkedArray, name: str, robot: RobotSpec = G1) -> NDArray[Any]:
     """Convert a column to (T,), (T, n) or, for depth, (T, H, W); errors have `frame` set."""
-    array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks)
-    if array.null_count:
-        null = array.is_null().to_numpy(zero_copy_only=False)
-        raise tiff.frame_error(int(np.argmax(null)), f"column {name} is null")
     if name == spec.DEPTH_KEY:
-        return tiff.decode(array.field("bytes"), *robot.depth)
-    dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name, robot)
-    if width == 1:
-        return np.asarray(array.to_numpy(zero_copy_only=False), dtype=dtype)
-    sizes = pc.list_value_length(array).to_numpy()
-    if (sizes != width).any():
-        at = int(np.argmax(sizes != width))
-        raise tiff.frame_error(at, f"column {name} has {sizes[at]} values, expected {width}")
-    flat = array.flatten().to_numpy(zero_copy_only=False)
-    return np.asarray(flat.reshape(len(array), width), dtype=dtype)
+        return tiff.decode(column.combine_chunks().field("bytes"), *robot.depth)
+    values = values_of(column, parse_feature(name, schema.feature_of(name, robot)))
+    return values[:, 0] if values.shape[1] == 1 else values

@@ -30,8 +30,6 @@ def camera_images(
     in m.
 
     Args:
-        row: the episode.
-        camera: its camera.
         table: the rows of the episode, which hold the images unless they are in a video.
         times: (T,) time of each row in the episode, s.
 
@@ -50,7 +48,8 @@ def camera_images(
         else:
             yield frame.to_ndarray(format="rgb24")
     if shown < len(times):
-        raise tiff.frame_error(shown, f"{camera.key} ends after {shown} of {len(times)} frames")
+        problem = f"{camera.key} ends after {shown} of {len(times)} frames"
+        raise DataError.without_place(problem, shown)
 
 
 def _depth_of(codes: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.float32]:
@@ -67,7 +66,7 @@ def _depth_of(codes: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.
 def decode_image(content: object, frame: int, key: str) -> Any:
     """The encoded image of a frame as a loaded Pillow image; raises `DataError` with `frame`."""
     if not isinstance(content, Mapping) or not content.get("bytes"):
-        raise tiff.frame_error(frame, f"{key} has no image in the file")
+        raise DataError.without_place(f"{key} has no image in the file", frame)
     with tiff.open_image(content["bytes"], frame, key) as image:
         image.load()
     return image

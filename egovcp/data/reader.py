@@ -53,7 +53,6 @@ class DatasetReader:
         """Read and check the `meta` folder. `open` also checks that the data files exist.
 
         Args:
-            source: the dataset's folder.
             cache: downloads the data files when they are read; None: they are in the folder.
             episodes: the selected episodes (see `select_episodes`).
         """

@@ -50,9 +50,14 @@ def features_of(robot: RobotSpec) -> dict[str, dict[str, object]]:
     return {**robot.features, **INDEX_FEATURES}
 
 
+def feature_of(key: str, robot: RobotSpec) -> Mapping[str, Any]:
+    """The description of a column."""
+    return INDEX_FEATURES.get(key) or robot.features[key]
+
+
 def width(key: str, robot: RobotSpec = G1) -> int:
     """Values per frame of a numeric column."""
-    shape = (INDEX_FEATURES.get(key) or robot.features[key])["shape"]
+    shape = feature_of(key, robot)["shape"]
     assert isinstance(shape, tuple)
     return int(shape[0])
 

@@ -23,7 +23,7 @@ from egovcp import spec
 from egovcp.data import dataset_files, schema, stats, tiff
 from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
-from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.errors import DataError
 from egovcp.files import sha256
 from egovcp.robot_spec import G1, RobotSpec
 
@@ -128,28 +128,6 @@ def from_buffer(buffer: pa.Buffer) -> EncodedEpisode:
     return EncodedEpisode(table.replace_schema_metadata(None), record, matrix, robot)
 
 
-@dataclass(frozen=True)
-class StagedEpisode:
-    """An encoded episode with its number in the collection and the SHA-256 of its bytes."""
-
-    number: int
-    sha256: str
-    payload: bytes
-
-    @classmethod
-    def of(cls, number: int, encoded: EncodedEpisode) -> StagedEpisode:
-        """Serialise an encoded episode."""
-        payload = to_bytes(encoded).to_pybytes()
-        return cls(number, hashlib.sha256(payload).hexdigest(), payload)
-
-    def verify(self) -> None:
-        """Raise `EnvironmentFailure` if the bytes were damaged in transit."""
-        if hashlib.sha256(self.payload).hexdigest() != self.sha256:
-            raise EnvironmentFailure(
-                f"episode {self.number} arrived damaged: its SHA-256 is not {self.sha256}"
-            )
-
-
 class StagingDir:
     """A folder of staged episodes: one file each, complete or absent.
 
@@ -159,12 +137,13 @@ class StagingDir:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def put(self, staged: StagedEpisode) -> None:
-        """Write an episode atomically and flush it to the disk."""
-        name = f"{staged.number:09d}-{staged.sha256}.arrow"
+    def put(self, number: int, encoded: EncodedEpisode) -> None:
+        """Write episode ``number`` of the collection atomically and flush it to the disk."""
+        content = memoryview(to_bytes(encoded))
+        name = f"{number:09d}-{hashlib.sha256(content).hexdigest()}.arrow"
         partial = self.folder / f".{name}.{os.getpid()}"
         try:
-            dataset_files.create_file(partial, staged.payload)
+            dataset_files.create_file(partial, content)
             dataset_files.sync(partial)
             dataset_files.rename(partial, self.folder / name)
         except OSError:

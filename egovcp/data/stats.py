@@ -115,10 +115,9 @@ def _nested(key: str, values: Matrix) -> list[Any]:
 def from_arrow(table: pa.Table, robot: RobotSpec = G1) -> list[Matrix]:
     """The matrices ``(R, D)`` of the episodes in a table of `to_arrow`."""
     places = layout(robot)
-    size = max(part.stop for part in places.values())
-    out: list[Matrix] = [np.empty((len(ROWS), size)) for _ in range(table.num_rows)]
+    out = np.empty((table.num_rows, len(ROWS), max(part.stop for part in places.values())))
     for key, part in places.items():
         for i, row in enumerate(ROWS):
-            for matrix, values in zip(out, table[f"stats/{key}/{row}"].to_pylist(), strict=True):
-                matrix[i, part] = np.ravel(values)
-    return out
+            values = np.array(table[f"stats/{key}/{row}"].to_pylist())
+            out[:, i, part] = values.reshape(table.num_rows, -1)
+    return list(out)

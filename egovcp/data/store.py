@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from egovcp.data import privileged
 from egovcp.data.episode import Episode, FrameLayout, frame_layout
-from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, episodes_fingerprint
+from egovcp.data.index import EpisodeIndex, episodes_fingerprint
 from egovcp.data.reader import DatasetReader
 from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
 from egovcp.robot_spec import G1, RobotSpec
@@ -79,14 +79,13 @@ class EpisodeStore:
         readers: Sequence[DatasetReader],
         split: str = "all",
         returns: ReturnConfig | None = None,
-        heldout_fraction: float = HELDOUT_FRACTION,
         per_task: int | None = None,
     ) -> Self:
         """Read the episodes of a split, at most ``per_task`` of each task, into memory.
 
         A frame takes 6.3 kB, nearly all depth.
         """
-        index = EpisodeIndex.of(readers, split, heldout_fraction)
+        index = EpisodeIndex.of(readers, split)
         return cls.read(index if per_task is None else index.subsample(per_task), returns)
 
     @classmethod

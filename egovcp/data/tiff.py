@@ -60,7 +60,7 @@ def decode(blobs: pa.BinaryArray, rows: int, cols: int) -> NDArray[np.uint16]:
     """``T`` TIFF blobs -> depth ``(T, rows, cols)`` uint16; fast for the layout of `encode`."""
     if blobs.null_count:
         empty = int(np.argmax(blobs.is_null().to_numpy(zero_copy_only=False)))
-        raise frame_error(empty, "its depth image is empty")
+        raise DataError.without_place("its depth image is empty", empty)
     raw = _fixed_size_bytes(blobs, len(header(rows, cols)) + 2 * rows * cols)
     if raw is not None:
         head = np.frombuffer(header(rows, cols), dtype=np.uint8)
@@ -86,7 +86,9 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
         found = f"{image.mode} {image.height}x{image.width}"
         if image.mode.startswith("I;16") and image.size == (cols, rows):
             return np.asarray(image).astype(np.uint16)
-    raise frame_error(frame, f"its depth image is {found}, expected uint16 {rows}x{cols}")
+    raise DataError.without_place(
+        f"its depth image is {found}, expected uint16 {rows}x{cols}", frame
+    )
 
 
 @contextmanager
@@ -97,8 +99,8 @@ def open_image(
     kind: str = "an image",
     formats: tuple[str, ...] | None = None,
 ) -> Iterator[Any]:
-    """An encoded image as a Pillow image, which is decoded in the block; errors are `frame_error`s
-    that call it ``name``."""
+    """An encoded image as a Pillow image, which is decoded in the block; errors are
+    `DataError`s with `frame` set that call it ``name``."""
     from PIL import Image, UnidentifiedImageError  # the layout of `encode` does not need it
 
     try:
@@ -108,14 +110,9 @@ def open_image(
         ):
             yield image
     except UnidentifiedImageError as error:
-        raise frame_error(frame, f"{name} is not {kind}") from error
+        raise DataError.without_place(f"{name} is not {kind}", frame) from error
     except Exception as error:  # Pillow's parsers raise many types on damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise frame_error(frame, f"{name} is not {kind} that can be read: {reason}") from error
-
-
-def frame_error(frame: int, problem: str, kind: type[DataError] = DataError) -> DataError:
-    """An error of one frame of an episode."""
-    error = kind(f"frame {frame}: {problem}")
-    error.frame, error.problem = frame, problem
-    return error
+        raise DataError.without_place(
+            f"{name} is not {kind} that can be read: {reason}", frame
+        ) from error

@@ -33,7 +33,7 @@ SIZE: Final = (640, 360)
 """Width and height of a video, pixels; even, as H.264 requires."""
 STRIDE: Final = 2
 """Steps between frames of a video: 12.5 frames per second."""
-_STYLES: Final = {
+_COLOURS: Final = {
     "value of the plan": "C0",
     "termination probability": "C3",
     "return so far": "C2",
@@ -52,11 +52,7 @@ class PictureSink:
     """Collects the ticks of a run and draws them on `close`, as a picture or a video."""
 
     def __init__(self, *paths: Path) -> None:
-        """Choose the files.
-
-        Args:
-            paths: ``.png`` for key frames, ``.gif`` or ``.mp4`` for a video.
-        """
+        """``paths``: ``.png`` for key frames, ``.gif`` or ``.mp4`` for a video."""
         self._paths = paths
         self._title = ""
         self._robot = G1
@@ -90,9 +86,7 @@ class PictureSink:
             write_videos(ticks, videos, self._robot)
 
 
-def rollout_picture(
-    ticks: Sequence[Tick], path: Path, title: str = "", robot: RobotSpec = G1
-) -> None:
+def rollout_picture(ticks: Sequence[Tick], path: Path, title: str, robot: RobotSpec) -> None:
     """Draw ``ticks`` (in order, without gaps) into the PNG ``path``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -114,17 +108,17 @@ def _place(figure: Any, bottom_inch: float, top_inch: float) -> dict[str, float]
     return {"left": 0.05, "right": 0.995, "bottom": bottom_inch / height, "top": top_inch / height}
 
 
-def key_frames(ticks: Sequence[Tick], count: int = KEY_FRAMES) -> list[int]:
-    """Indices of up to ``count`` ticks, evenly spaced from just before the first event to just
+def key_frames(ticks: Sequence[Tick]) -> list[int]:
+    """Indices of up to `KEY_FRAMES` ticks, evenly spaced from just before the first event to just
     after the last, or over the whole run without events."""
     last = len(ticks) - 1
     eventful = [i for i, tick in enumerate(ticks) if tick.events]
     begin = max(0, eventful[0] - _BEFORE_TICKS) if eventful else 0
     end = min(last, eventful[-1] + _AFTER_TICKS) if eventful else last
-    return sorted({int(i) for i in np.rint(np.linspace(begin, end, count))})
+    return sorted({int(i) for i in np.rint(np.linspace(begin, end, KEY_FRAMES))})
 
 
-def depth_rows(ticks: Sequence[Tick], frames: Sequence[int], robot: RobotSpec = G1) -> DepthRows:
+def depth_rows(ticks: Sequence[Tick], frames: Sequence[int], robot: RobotSpec) -> DepthRows:
     """The rows of depth images; a row without any image is left out."""
     before = f"imagined\n{AHEAD / robot.planner_hz:.2f} s before"
     rows: DepthRows = {
@@ -158,7 +152,7 @@ def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
     return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
 
 
-def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None, robot: RobotSpec = G1) -> None:
+def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None, robot: RobotSpec) -> None:
     """Draw a depth image (H, W) in m; None: an empty field."""
     axes.set(xticks=[], yticks=[])
     if depth_m is None:
@@ -170,15 +164,13 @@ def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None, robot: RobotSpec
     axes.imshow(shown, cmap="viridis_r", vmin=0.06 * robot.depth_max_m, vmax=robot.depth_max_m)
 
 
-def grey_image(
-    depth_m: NDArray[np.floating], magnify: int = 4, robot: RobotSpec = G1
-) -> NDArray[np.uint8]:
-    """Depth (H, W) in m as an image (H * magnify, W * magnify, 3): near is bright, invalid black.
+def grey_image(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Depth (H, W) in m of the G1 as an image (4 H, 4 W, 3): near is bright, invalid black.
 
     Video encoders need more than 64 columns.
     """
-    near = np.where(depth_m == 0, 0.0, 255.0 * (1.0 - depth_m / robot.depth_max_m))
-    grey = near.clip(0, 255).astype(np.uint8).repeat(magnify, 0).repeat(magnify, 1)
+    near = np.where(depth_m == 0, 0.0, 255.0 * (1.0 - depth_m / G1.depth_max_m))
+    grey = near.clip(0, 255).astype(np.uint8).repeat(4, 0).repeat(4, 1)
     return np.stack([grey] * 3, -1)
 
 
@@ -196,29 +188,22 @@ def _curves(figure: Any, ticks: Sequence[Tick], frames: Sequence[int], dt: float
     shown = curves(ticks)
     place = _place(figure, 0.516, 2.021)
     plots = figure.add_gridspec(1, len(shown), wspace=0.13, **place).subplots(squeeze=False)[0]
-    for axes, (name, values) in zip(plots, shown.items(), strict=True):
-        _curve(axes, ticks, values, _STYLES[name], dt)
-        axes.set_title(name, fontsize=9, loc="left")
-        for i in frames:
-            axes.axvline(ticks[i].index * dt, color="0.9", linewidth=1, zorder=0)
-
-
-def _curve(
-    axes: Any, ticks: Sequence[Tick], values: list[float | None], style: str, dt: float
-) -> None:
     time = [tick.index * dt for tick in ticks]
-    axes.plot(time, [np.nan if value is None else value for value in values], color=style)
-    axes.margins(x=0.01, y=0.25)
-    _mark_events(axes, ticks, time)
-    axes.set_xlabel("s", fontsize=9, labelpad=0)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
+    for axes, (name, values) in zip(plots, shown.items(), strict=True):
+        axes.plot(time, np.array(values, np.float64), color=_COLOURS[name])
+        axes.margins(x=0.01, y=0.25)
+        axes.set_title(name, fontsize=9, loc="left")
+        axes.set_xlabel("s", fontsize=9, labelpad=0)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        _mark_events(axes, ticks, time)
+        for i in frames:
+            axes.axvline(time[i], color="0.9", linewidth=1, zorder=0)
 
 
 def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
     """A dashed line and its text per event, one below the other at the top of the plot."""
-    eventful = [(t, tick.events) for t, tick in zip(time, ticks, strict=True) if tick.events]
-    lines = [(t, text) for t, events in eventful for text in events]
+    lines = [(t, text) for t, tick in zip(time, ticks, strict=True) for text in tick.events]
     for row, (time_s, text) in enumerate(lines):
         axes.axvline(time_s, color="0.4", linewidth=0.8, linestyle="--")
         late = time_s > 0.6 * time[-1]
@@ -234,7 +219,7 @@ def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
         )
 
 
-def write_videos(ticks: Sequence[Tick], paths: Sequence[Path], robot: RobotSpec = G1) -> None:
+def write_videos(ticks: Sequence[Tick], paths: Sequence[Path], robot: RobotSpec) -> None:
     """Draw ``ticks`` (in order, without gaps) into each path, a ``.gif`` or ``.mp4``.
 
     Raises:
@@ -246,7 +231,7 @@ def write_videos(ticks: Sequence[Tick], paths: Sequence[Path], robot: RobotSpec 
         write(images, path, dt)
 
 
-def video_frames(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Frame]:
+def video_frames(ticks: Sequence[Tick], robot: RobotSpec) -> Iterator[Frame]:
     """Every `STRIDE`-th tick as an RGB image (H, W, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

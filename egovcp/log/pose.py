@@ -8,20 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView, Tick
-from egovcp.robot.geometry import heading_rotation, quaternion, rotation_matrix
-from egovcp.robot.kinematics import LINK_NAMES, PALM_OFFSET, link_transforms
+from egovcp.robot.geometry import heading_rotation, quaternion, rotate, rotation_matrix
+from egovcp.robot.kinematics import LINK_NAMES, PALM_OFFSET, WRISTS, link_transforms
 from egovcp.spec import STATE_SLICES
 
 Array = NDArray[np.float64]
-
-#: Links that carry the palms, left and right.
-WRISTS: Final = [LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
 
 
 @dataclass(frozen=True)
@@ -80,8 +76,8 @@ def _place(tick: Tick, height: float, tilt: Array, positions: Array, rotations: 
         pelvis = rotation_matrix(tick.base[3:])
     positions_w = origin + positions @ pelvis.T
     rotations_w = pelvis @ rotations
-    palms = np.stack([rotations_w[i] @ PALM_OFFSET[k] for k, i in enumerate(WRISTS)])
-    return RobotPose(positions_w, rotations_w, _yaw_only(pelvis), positions_w[WRISTS] + palms)
+    palms = positions_w[WRISTS] + rotate(rotations_w[WRISTS], PALM_OFFSET)
+    return RobotPose(positions_w, rotations_w, _yaw_only(pelvis), palms)
 
 
 def _yaw_only(rotation: Array) -> Array:

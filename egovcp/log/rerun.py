@@ -18,15 +18,15 @@ import rerun.blueprint as rrb
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
-from egovcp.log.blueprint import blueprint, robot_blueprint, signals_blueprint
+from egovcp.log.blueprint import blueprint, signals_blueprint
 from egovcp.log.meshes import LEFT, OBSTACLE, RIGHT, SPHERE, LinkMesh, link_meshes
 from egovcp.log.pose import robot_poses
 from egovcp.log.rerun_columns import (
     Columns,
     Frame,
-    all_columns,
+    common_columns,
+    g1_columns,
     log_value_map_styles,
-    plain_columns,
     skeleton_columns,
 )
 from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
@@ -78,9 +78,8 @@ class RerunSink:
         self._view, self._robot = info.camera, info.robot
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
-        layout = signals_blueprint() if self._signals else blueprint()
-        if not info.robot.is_g1:
-            layout = robot_blueprint(info.robot)
+        self._planned = info.robot.is_g1 and not self._signals
+        layout = blueprint() if self._planned else signals_blueprint(info.robot)
         if isinstance(self._destination, Viewer):
             self._destination.attach(stream, layout)
         else:
@@ -88,15 +87,12 @@ class RerunSink:
         stream.send_recording_name(name)
         self._stream = stream
         _log_static(stream, info)
-        if not info.robot.is_g1:
-            log_styles(stream, info.robot)
-            return
-        if self._signals:
-            log_styles(stream)
-        else:
+        if self._planned:
             log_value_map_styles(stream)
             log_motor_styles(stream)
-        self._meshes = link_meshes() if self._wants_meshes else {}
+        else:
+            log_styles(stream, info.robot)
+        self._meshes = link_meshes() if self._wants_meshes and info.robot.is_g1 else {}
         for link, mesh in self._meshes.items():
             surface = rr.Mesh3D(
                 vertex_positions=mesh.vertices,
@@ -111,19 +107,25 @@ class RerunSink:
         self._batch.append(tick)
         if len(self._batch) >= self._batch_ticks:
             self._send()
-            self._flush()
 
     def close(self) -> None:
         if self._stream is None or self._failed:
             return
-        if self._batch:
-            self._send()
-        self._flush()
+        self._send()
         self._stream.disconnect()
         self._stream = None
 
-    def _flush(self) -> None:
+    def _send(self) -> None:
+        """Send the batch, and wait until it is written."""
         assert self._stream is not None, "open the sink before writing to it"
+        for thing in (thing for tick in self._batch for thing in tick.scene):
+            if thing.name not in self._known:
+                self._known.add(thing.name)
+                self._stream.log(f"{paths.SCENE}/{thing.name}", _shape(thing), static=True)
+        for path, ticks, columns in self._columns() if self._batch else ():
+            if ticks:
+                self._stream.send_columns(path, _times(ticks), columns)
+        self._batch.clear()
         try:
             self._stream.flush(timeout_sec=self._timeout_s)
         except RuntimeError as error:
@@ -132,37 +134,20 @@ class RerunSink:
                 f"cannot send the recording: disk full, or viewer closed ({error})"
             ) from error
 
-    def _send(self) -> None:
-        assert self._stream is not None, "open the sink before writing to it"
-        self._log_new_objects()
-        for path, ticks, columns in self._columns():
-            if ticks:
-                self._stream.send_columns(path, _times(ticks), columns)
-        self._batch.clear()
-
     def _columns(self) -> list[Columns]:
         """All columns of the batch."""
-        if not self._robot.is_g1:
-            return [*plain_columns(self._batch), *signal_columns(self._batch, self._robot)]
-        poses = robot_poses(self._batch)
-        frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
-        groups = [*all_columns(frames, self._view)]
-        if not self._meshes:
-            groups.append(skeleton_columns(frames))
-        if self._signals:
-            groups += signal_columns(self._batch)
-        else:
+        groups = [*common_columns(self._batch)]
+        if self._robot.is_g1:
+            poses = robot_poses(self._batch)
+            frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
+            groups += g1_columns(frames, self._view)
+            if not self._meshes:
+                groups.append(skeleton_columns(frames))
+        if self._planned:
             groups += motor_columns(self._batch, self._faulty_joints)
+        else:
+            groups += signal_columns(self._batch, self._robot)
         return groups
-
-    def _log_new_objects(self) -> None:
-        assert self._stream is not None, "open the sink before writing to it"
-        for tick in self._batch:
-            for thing in tick.scene:
-                if thing.name not in self._known:
-                    self._known.add(thing.name)
-                    path = f"{paths.SCENE}/{thing.name}"
-                    self._stream.log(path, _shape(thing), static=True)
 
 
 def _create_file(path: Path, stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:

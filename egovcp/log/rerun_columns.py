@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from egovcp.log import paths
 from egovcp.log.meshes import SPHERE, value_colours
 from egovcp.log.messages import to_millimetres
-from egovcp.log.pose import WRISTS, RobotPose
+from egovcp.log.pose import RobotPose
 from egovcp.log.tick import CameraView, Hand, Tick, ValueMap
 from egovcp.robot.geometry import quaternion
-from egovcp.robot.kinematics import LINK_NAMES, PARENT
+from egovcp.robot.kinematics import LINK_NAMES, PARENT, WRISTS
 from egovcp.spec import ACTION_BOX, ACTION_HANDS, STATE_SLICES, Solid
 
 Array = NDArray[np.floating]
@@ -41,25 +41,20 @@ class Columns(NamedTuple):
     columns: Iterable[Any]
 
 
-def all_columns(frames: Sequence[Frame], view: CameraView) -> Iterator[Columns]:
-    """Everything that changes with time."""
+def common_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
+    """What changes with time for every robot."""
+    yield from _depths(ticks)
+    yield from _scene(ticks)
+    yield from _scalars(ticks)
+    yield from _events(ticks)
+
+
+def g1_columns(frames: Sequence[Frame], view: CameraView) -> Iterator[Columns]:
+    """What also changes with time for the G1, whose links are known."""
     yield from _robot(frames)
     yield _camera(frames, view)
-    ticks = [frame.tick for frame in frames]
-    yield from _depths(ticks)
     yield from _plans(frames)
-    yield from _scene(ticks)
-    yield from _scalars(ticks)
-    yield from _events(ticks)
-    yield from _value_maps(ticks)
-
-
-def plain_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
-    """The same for a robot of another kind than the G1, whose links are not known."""
-    yield from _depths(ticks)
-    yield from _scene(ticks)
-    yield from _scalars(ticks)
-    yield from _events(ticks)
+    yield from _value_maps([frame.tick for frame in frames])
 
 
 def _poses(positions: Array, quaternions_wxyz: Array) -> Iterable[Any]:

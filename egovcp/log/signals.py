@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from egovcp.log import paths
 from egovcp.log.rerun_columns import Columns, named_columns
 from egovcp.log.tick import MODES, Tick
-from egovcp.robot_spec import G1, RobotSpec
-from egovcp.spec import ACTION_BOX, ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
+from egovcp.robot_spec import RobotSpec
+from egovcp.spec import ACTION_BOX, JOINT_NAMES
 
 _LEG_JOINTS: Final = ("hip", "knee", "ankle")
 LIMBS: Final = ("left_leg", "right_leg", "waist", "left_arm", "right_arm")
@@ -47,33 +47,20 @@ _JOINTS_OF: Final = {
 }
 
 
-def _metric(tick: Tick) -> NDArray[np.float64]:
-    return ACTION_BOX.to_metric(np.asarray(tick.action_sent))
-
-
-def _actions() -> Iterator[Signal]:
-    yield Signal(f"{paths.ACTION}/normalised", ACTION_NAMES, lambda tick: tick.action_sent)
-    yield Signal(f"{paths.ACTION}/left_hand", tuple("xyz"), lambda tick: _metric(tick)[:3])
-    yield Signal(f"{paths.ACTION}/right_hand", tuple("xyz"), lambda tick: _metric(tick)[3:6])
-    yield Signal(f"{paths.ACTION}/height", ("height",), lambda tick: _metric(tick)[6:])
-
-
-def _states() -> Iterator[Signal]:
-    for group, part in STATE_SLICES.items():
-        if not group.startswith("joint_"):
-            yield _state(group, range(part.start, part.stop))
-    for group in ("joint_position", "joint_velocity"):
-        first = STATE_SLICES[group].start
-        for name, joints in _JOINTS_OF.items():
-            yield _state(f"{group}/{name}", [first + i for i in joints])
-
-
-def _state(path: str, indices: Sequence[int]) -> Signal:
-    names = tuple(STATE_NAMES[i].removeprefix(f"{path}.").removeprefix("command.") for i in indices)
-    return Signal(f"{paths.STATE}/{path}", names, lambda tick: tick.state[list(indices)])
-
-
-def _outcomes() -> Iterator[Signal]:
+def signals_of(robot: RobotSpec) -> Iterator[Signal]:
+    """The signals of a robot: actions, each group of states, and outcome; of the G1 also the
+    targets of hands and height, and the states of joints by limb."""
+    yield Signal(f"{paths.ACTION}/normalised", robot.action_names, lambda tick: tick.action_sent)
+    if robot.is_g1:
+        yield Signal(f"{paths.ACTION}/left_hand", tuple("xyz"), lambda tick: _metric(tick)[:3])
+        yield Signal(f"{paths.ACTION}/right_hand", tuple("xyz"), lambda tick: _metric(tick)[3:6])
+        yield Signal(f"{paths.ACTION}/height", ("height",), lambda tick: _metric(tick)[6:])
+    for group, part in robot.state_slices.items():
+        if robot.is_g1 and group.startswith("joint_"):
+            for name, joints in _JOINTS_OF.items():
+                yield _state(robot, f"{group}/{name}", [part.start + i for i in joints])
+        else:
+            yield _state(robot, group, range(part.start, part.stop))
     yield Signal(
         paths.OUTCOME,
         ("done", "success"),
@@ -81,30 +68,23 @@ def _outcomes() -> Iterator[Signal]:
     )
 
 
-SIGNALS: Final = (*_actions(), *_states(), *_outcomes())
+def _metric(tick: Tick) -> NDArray[np.float64]:
+    return ACTION_BOX.to_metric(np.asarray(tick.action_sent))
 
 
-def signals_of(robot: RobotSpec) -> tuple[Signal, ...]:
-    """The signals of a robot; for other robots than the G1: actions and each group of states."""
-    if robot.is_g1:
-        return SIGNALS
-    action = Signal(f"{paths.ACTION}/normalised", robot.action_names, lambda tick: tick.action_sent)
-    return (action, *(_group(robot, name) for name in robot.state_slices), *_outcomes())
+def _state(robot: RobotSpec, path: str, indices: Sequence[int]) -> Signal:
+    names = (robot.state_names[i].removeprefix(f"{path}.") for i in indices)
+    lines = tuple(name.removeprefix("command.") for name in names)
+    return Signal(f"{paths.STATE}/{path}", lines, lambda tick: tick.state[list(indices)])
 
 
-def _group(robot: RobotSpec, name: str) -> Signal:
-    part = robot.state_slices[name]
-    names = tuple(text.removeprefix(f"{name}.") for text in robot.state_names[part])
-    return Signal(f"{paths.STATE}/{name}", names, lambda tick: tick.state[part])
-
-
-def log_styles(stream: rr.RecordingStream, robot: RobotSpec = G1) -> None:
+def log_styles(stream: rr.RecordingStream, robot: RobotSpec) -> None:
     """Log the names of the lines of every signal, once per recording."""
     for signal in signals_of(robot):
         stream.log(signal.path, rr.SeriesLines(names=list(signal.names)), static=True)
 
 
-def signal_columns(ticks: Sequence[Tick], robot: RobotSpec = G1) -> Iterator[Columns]:
+def signal_columns(ticks: Sequence[Tick], robot: RobotSpec) -> Iterator[Columns]:
     for signal in signals_of(robot):
         values = np.array([signal.values(tick) for tick in ticks], np.float64)  # (n, lines)
         columns = rr.Scalars.columns(scalars=values.ravel())

@@ -10,6 +10,7 @@ machine, forward both ports: ``ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876
 from __future__ import annotations
 
 import re
+import shutil
 import socket
 import subprocess
 import time
@@ -23,7 +24,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.parent_death import command
 
 LOOPBACK: Final = "127.0.0.1"
 GRPC_PORT: Final = 9876  # Rerun's default
@@ -118,7 +118,7 @@ class LiveRerun:
             _require_free(port)
         program, flags = str(_program()), self._flags()
         self._process = subprocess.Popen(
-            command(program, *flags) if self.kind == "web" else [program, *flags],
+            [*(_ended_with_parent() if self.kind == "web" else []), program, *flags],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -172,6 +172,13 @@ def _program() -> Path:
 
 def _url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def _ended_with_parent() -> list[str]:
+    """Prefix of a command, which the kernel then kills with the thread that started it; empty where
+    util-linux is missing."""
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "KILL"] if setpriv else []
 
 
 def _require_free(port: int) -> None:

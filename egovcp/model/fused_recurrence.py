@@ -44,7 +44,6 @@ def filter_window(
     """Filter a window of observations: states and posteriors, (B, T, ...).
 
     Args:
-        model: the world model.
         start: h (B, H) and z (B, Z) of the step before the window.
         action: (B, T, 7), a_{t-1} of each step.
         first: (B, T) bool, an episode begins at this step.
@@ -75,7 +74,6 @@ def imagine_window(
     """Repeat `WorldModel.imagine`; returns the states after each step.
 
     Args:
-        model: the world model.
         start: h (N, H) and z (N, Z).
         action: (R, 7), the actions of all steps in rows.
         rows: number of rows of each step, at most N and not increasing: states beyond it are not

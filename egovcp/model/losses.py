@@ -62,29 +62,18 @@ class Rollout(NamedTuple):
     state: Tensor  # (B, T, 74) standardised
 
 
-def filter_sequence(
-    model: WorldModel,
-    batch: Batch,
-    carry: Carry | None = None,
-    generator: torch.Generator | None = None,
-    *,
-    sample: bool = True,
-    noise: Tensor | None = None,
-) -> Rollout:
+def filter_sequence(model: WorldModel, batch: Batch, noise: Tensor | None = None) -> Rollout:
     """Run the posterior over whole sequences, as `WorldModel.observe` does step by step.
 
-    Training samples z with ``noise`` (`latent_noise`), sampled here if None. Without ``sample`` z
-    is the posterior mean, as in deployment.
+    Training samples z with ``noise`` (`latent_noise`). Without it z is the posterior mean, as in
+    deployment.
     """
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
     state = model.standardise(batch.state)
     embedding = _embed(model, near, state.flatten(0, 1)).view(size, length, -1)
-    carry = model.initial(size) if carry is None else carry
-    if sample and noise is None:
-        noise = latent_noise(model, batch, generator)
     states, posterior = filter_window(
-        model, carry, batch.prev_action, batch.is_first, embedding, noise
+        model, model.initial(size), batch.prev_action, batch.is_first, embedding, noise
     )
     return Rollout(
         states,
@@ -95,9 +84,7 @@ def filter_sequence(
     )
 
 
-def latent_noise(
-    model: WorldModel, batch: Batch, generator: torch.Generator | None = None
-) -> Tensor:
+def latent_noise(model: WorldModel, batch: Batch, generator: torch.Generator | None) -> Tensor:
     """Noise of z, (T, B, Z), sampled step by step."""
     size, length = batch.valid.shape
     shape, device = (size, model.config.latent), batch.state.device
@@ -163,8 +150,6 @@ def depth_loss(
     """Gaussian negative log likelihood of every n-th image, pixels weighted.
 
     Args:
-        model: the world model.
-        rollout: the filtered batch.
         valid: (B, T) bool, rows to average over.
         weight: (B, T, H, W) of the pixels.
         every: n.
@@ -176,7 +161,7 @@ def depth_loss(
     return masked_mean(image_error(image, near, weight[rows]), valid[rows])
 
 
-def first_image(every: int, batch: Batch, generator: torch.Generator | None = None) -> int:
+def first_image(every: int, batch: Batch, generator: torch.Generator | None) -> int:
     """Random index of the first image that is decoded, below n."""
     every = min(every, batch.valid.shape[1])
     return int(torch.randint(every, (), generator=generator, device=batch.valid.device))

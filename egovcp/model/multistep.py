@@ -62,9 +62,6 @@ def multistep_losses(
     """Decoded observations and object of states imagined ``multistep_horizons`` steps ahead.
 
     Args:
-        model: the world model.
-        rollout: the filtered batch.
-        batch: the recorded windows.
         weight: (B, T, H, W) of the pixels.
         first: first row to imagine from, see `first_row`.
     """
@@ -105,9 +102,6 @@ def imagine_ahead(
     """Imagine with the recorded actions from every n-th filtered state (B, T, ...).
 
     Args:
-        model: the world model.
-        carry: the filtered states.
-        batch: the recorded windows.
         ahead: horizons, steps.
         first: first row to imagine from.
 

@@ -19,27 +19,19 @@ class SplitLinear(nn.Module):
     recurrence.
     """
 
-    def __init__(self, inputs: Sequence[int], outputs: int, bias: bool = False) -> None:
+    def __init__(self, inputs: Sequence[int], outputs: int) -> None:
         super().__init__()
-        self.inputs = sum(inputs)
         self.parts = nn.ModuleList(nn.Linear(n, outputs, bias=False) for n in inputs)
-        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
-        self.reset_parameters()
-
-    def reset_parameters(self) -> None:
-        """Initialise like one Linear on the concatenation."""
-        bound = self.inputs**-0.5
+        bound = sum(inputs) ** -0.5  # of the weights of one Linear on the concatenation
         for part in self.parts:
             nn.init.uniform_(part.weight, -bound, bound)  # type: ignore[arg-type]
-        if self.bias is not None:
-            nn.init.zeros_(self.bias)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """One tensor (..., n_i) per part -> (..., outputs)."""
         total: Tensor = self.parts[0](inputs[0])
         for part, x in zip(self.parts[1:], inputs[1:], strict=True):
             total = total + part(x)
-        return total if self.bias is None else total + self.bias
+        return total
 
 
 class SplitMlp(nn.Module):

@@ -9,8 +9,9 @@ threads; then of the filter, from the sum of the two.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import torch
@@ -25,7 +26,6 @@ from egovcp.model.multistep import (
     first_row,
     multistep_losses,
 )
-from egovcp.model.parallel import run_parallel
 from egovcp.model.privileged_value import sample_actions
 from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
@@ -69,13 +69,11 @@ def world_model_loss(
     """Total loss of equation 6 and its terms (scalars, detached).
 
     Args:
-        model: the world model.
-        batch: windows of episodes.
         noise: random numbers, or the generator that samples them; None: torch's default generator.
         critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
     """
     draws = noise if isinstance(noise, StepNoise) else sample_step_noise(model, batch, noise)
-    rollout = losses.filter_sequence(model, batch, noise=draws.noise)
+    rollout = losses.filter_sequence(model, batch, draws.noise)
     filtered, imagined = _term_groups(model, rollout, batch, draws, critic)
     terms = filtered() | imagined()
     return _sum(terms), _named(terms)
@@ -94,15 +92,13 @@ def world_model_gradients(
     Never synchronises with a GPU.
 
     Args:
-        model: the world model.
-        batch: windows of episodes.
         draws: random numbers of the step.
         critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
         precision: context (autocast) of the losses, not of their gradients.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
     with precision():  # one outer context: leaving the last one clears autocast's weight cache
-        rollout = losses.filter_sequence(model, batch, noise=draws.noise)
+        rollout = losses.filter_sequence(model, batch, draws.noise)
         leaves, outer, states = _detach(rollout)
 
         def with_gradient(group: TermGroup) -> tuple[Terms, list[Tensor | None]]:
@@ -129,6 +125,40 @@ def world_model_gradients(
     torch.autograd.backward([x for x, _ in known], [g for _, g in known])  # adds up each end's
     terms |= more
     return _sum(terms).detach(), _named(terms), rollout.carry.map(Tensor.detach)
+
+
+def run_parallel[A, B](first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+    """Run two independent computations at once, each with half of torch's threads.
+
+    Small operations gain little from a second thread; two independent computations keep two threads
+    busy. With one torch thread they run one after the other.
+
+    ``second`` runs in another thread and does not inherit contexts (autograd, autocast). If both
+    fail, the error of ``first`` is raised.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1:
+        return first(), second()
+
+    def in_thread() -> B:
+        torch.set_num_threads(threads // 2)
+        return second()
+
+    torch.set_num_threads(threads - threads // 2)
+    task = _thread().submit(in_thread)
+    try:
+        result = first()
+    finally:
+        wait([task])
+        torch.set_num_threads(threads)
+    return result, task.result()
+
+
+@cache
+def _thread() -> ThreadPoolExecutor:
+    # An outermost autocast context is kept open: leaving it would clear the cast cache of all
+    # threads, so that some weights would be cast, and their gradients rounded, twice.
+    return ThreadPoolExecutor(1, "run_parallel", torch.autocast_increment_nesting)
 
 
 def _term_groups(

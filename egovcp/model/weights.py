@@ -61,10 +61,8 @@ def load_model(
     """Build a model in evaluation mode with the weights of a file.
 
     Args:
-        config: configuration of the model.
         shapes: its `tensor_shapes`.
         content: bytes of the file.
-        robot: the robot of the model.
 
     Raises:
         UnsafeFileError: the tensors do not match the configuration, a value is not finite, or an

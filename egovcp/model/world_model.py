@@ -199,14 +199,8 @@ class WorldModel(nn.Module):
         Rows with ``is_first`` start from zeros and the neutral action. z is the
         posterior mean.
         """
-        near = nearness(depth, self.config.depth_max_m)
-        return self.observe_near(carry, action, near, state, is_first)
-
-    def observe_near(
-        self, carry: Carry, action: Tensor, near: Tensor, state: Tensor, is_first: Tensor
-    ) -> Carry:
-        """The same from nearness (B, 48, 64)."""
         h = self.advance(carry, action, is_first)
+        near = nearness(depth, self.config.depth_max_m)
         embedding = self.embed_near(near, self.standardise(state))
         return Carry(h, self.infer(h, embedding).mean)
 
@@ -244,10 +238,7 @@ class WorldModel(nn.Module):
     def value(self, carry: Carry, action: Tensor, head: SplitMlp | None = None) -> Tensor:
         """Q(h, z, a) in units of return, (...,); equation 5.
 
-        Args:
-            carry: the states (...,).
-            action: (..., 7).
-            head: another head than the model's own, such as a target network.
+        ``head`` is another head than the model's own, such as a target network.
         """
         head = self.value_head if head is None else head
         q = value.read(head(carry.h, carry.z, action), self.config.value_loss)

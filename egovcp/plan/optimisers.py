@@ -59,10 +59,6 @@ class CrossEntropy:
 
 def refit(elites: Tensor, usable: Tensor, state: SearchState) -> tuple[Tensor, Tensor]:
     """Mean and deviation (E, N, 7) of the usable elites (E, elites, N, 7); without any, the old."""
-    if _all_on_cpu(usable):
-        mean = elites.sum(1) / elites.shape[1]
-        squares = (elites - mean[:, None]).square_()
-        return mean, (squares.sum(1) / elites.shape[1]).sqrt_()
     weight = usable[:, :, None, None].to(elites.dtype)
     count = weight.sum(1)
     fitted = (elites * weight).sum(1) / count.clamp_min(1.0)
@@ -74,15 +70,8 @@ def refit(elites: Tensor, usable: Tensor, state: SearchState) -> tuple[Tensor, T
 
 def mean_value(top: Tensor, usable: Tensor) -> Tensor:
     """Mean (E,) of the usable ones of (E, elites); -inf without any."""
-    if _all_on_cpu(usable):
-        return top.sum(1) / top.shape[1]
     value = top.masked_fill(~usable, 0.0).sum(1) / usable.sum(1).clamp_min(1)
     return value.masked_fill(~usable.any(1), -torch.inf)
-
-
-def _all_on_cpu(usable: Tensor) -> bool:
-    """Whether all are true; false on other devices, where reading the result would block."""
-    return usable.device.type == "cpu" and bool(usable.all())
 
 
 class KernelCrossEntropy:

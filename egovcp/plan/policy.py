@@ -153,8 +153,6 @@ class Policy:
         """Observe depth (E, 48, 64) mm and state (E, 74), and plan.
 
         Args:
-            depth: as in `observe`.
-            state: as in `observe`.
             remaining: seconds until the result is due (`egovcp.plan.time_left_until`); the planner
                 does as many iterations as fit, at least one. None: all of them.
         """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -61,7 +61,10 @@ class SearchState(NamedTuple):
 
 
 class Optimiser(Protocol):
-    """Samples candidates, and updates its state from their values."""
+    """Samples candidates, and updates its state from their values.
+
+    It may have its own, bit-identical implementation of `random_walk`.
+    """
 
     def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """(E, M, N, 7) deltas; the first candidate is ``state.mean`` in iteration 0."""
@@ -69,15 +72,6 @@ class Optimiser(Protocol):
 
     def update(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """Update from the ``values`` (E, M) of candidates; -inf where J was not finite."""
-        ...
-
-
-@runtime_checkable
-class FastRandomWalk(Protocol):
-    """An optimiser with its own implementation of `random_walk`."""
-
-    def random_walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-        """As the module function, bit-identical: (E, M, N, 7) from (E, 1, 7)."""
         ...
 
 
@@ -123,7 +117,7 @@ def make_plan[C](
     slowest = 0.0
     state = _start(executed, config, warm)
     plan_value = evaluator.at(carry)
-    walk = optimiser.random_walk if isinstance(optimiser, FastRandomWalk) else random_walk
+    walk = getattr(optimiser, "random_walk", random_walk)
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
         deltas = optimiser.propose(state, iteration, generator)  # (E, M, N, 7)

@@ -33,7 +33,6 @@ _OFFSET: Final = JOINT_OFFSET[ARMS].reshape(*_SHAPE, 3)
 MASS: Final = LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
 _COM: Final = LINK_COM[_FIRST_LINK:].reshape(*_SHAPE, 3)
 _AXIS: Final = np.argmax(np.abs(JOINT_AXIS[ARMS]), axis=-1)  # (14,) 0, 1 or 2
-_PALM: Final = PALM_OFFSET  # (2, 3)
 LOWER: Final = JOINT_LOWER[ARMS].reshape(_SHAPE)
 UPPER: Final = JOINT_UPPER[ARMS].reshape(_SHAPE)
 SHOULDER: Final = _OFFSET[:, 0]  # (2, 3) m, torso frame
@@ -108,7 +107,7 @@ def forward(joint_position: Array) -> ArmPose:
     for i in range(1, 7):
         chain[:, :, i] = chain[:, :, i - 1] @ chain[:, :, i]
     axis = np.take(chain.reshape(batch, _H0.size), _AXIS_ENTRIES, axis=1)
-    palm = chain[:, :, 6, :3, 3] + rotate(chain[:, :, 6, :3, :3], _PALM)
+    palm = chain[:, :, 6, :3, 3] + rotate(chain[:, :, 6, :3, :3], PALM_OFFSET)
     return ArmPose(chain[..., :3, 3], axis, chain[..., :3, :3], palm)
 
 

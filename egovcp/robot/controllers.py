@@ -23,7 +23,8 @@ _SHIPPED: Final = "g1_walk.safetensors"
 class LowLevelController(Protocol):
     """Tracks the command c = [v, p_ee, h_body] in the observation; batched over robots, 50 Hz.
 
-    It reads proprioception only, as a real G1 measures it (section III-A of the paper).
+    It reads proprioception only, as a real G1 measures it (section III-A of the paper). The joint
+    servos must run the gains ``g1.STIFFNESS`` and ``g1.DAMPING``.
     """
 
     @property
@@ -39,16 +40,6 @@ class LowLevelController(Protocol):
     @property
     def stepping(self) -> NDArray[np.bool_]:
         """(B,) which robots were taking steps in the last `step`."""
-        ...
-
-    @property
-    def stiffness(self) -> NDArray[np.float64]:
-        """(J,) proportional gains that the joint servos must run, N m/rad."""
-        ...
-
-    @property
-    def damping(self) -> NDArray[np.float64]:
-        """(J,) derivative gains that the joint servos must run, N m s/rad."""
         ...
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:

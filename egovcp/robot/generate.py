@@ -51,12 +51,6 @@ def kinematic_table(model: mujoco.MjModel) -> dict[str, Any]:
     }
 
 
-def write_kinematics(path: Path) -> None:
-    """Write ``g1_kinematics.json``."""
-    table = kinematic_table(robot_spec().compile())
-    path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
-
-
 def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.floating]]:
     """All numbers of the stance law at one pelvis height."""
     pose = balanced_pose(stance, height)
@@ -75,18 +69,15 @@ def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.float
     }
 
 
-def write_stance(path: Path) -> None:
-    """Write ``g1_stance.npz``."""
-    stance = StanceModel(robot_spec().compile())
-    rows = [stance_row(stance, height) for height in HEIGHTS]
-    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    np.savez(path, allow_pickle=False, **arrays)
-
-
 def main() -> None:
     """Regenerate every table in place."""
-    write_kinematics(PACKAGE / "g1_kinematics.json")
-    write_stance(PACKAGE / "g1_stance.npz")
+    model = robot_spec().compile()
+    table = json.dumps(kinematic_table(model), indent=1) + "\n"
+    (PACKAGE / "g1_kinematics.json").write_text(table, encoding="utf-8")
+    stance = StanceModel(model)
+    rows = [stance_row(stance, height) for height in HEIGHTS]
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    np.savez(PACKAGE / "g1_stance.npz", allow_pickle=False, **arrays)
 
 
 if __name__ == "__main__":

@@ -41,21 +41,20 @@ JOINT_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the pare
 ANKLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
 HALF_STANCE_WIDTH: Final = 0.1185  # m, from the ankles to the midline in the standing pose
 _NUM_LEG_JOINTS: Final = 12  # the first joints; each leg is a chain of six from the pelvis
-TORSO_LINK: Final = LINK_NAMES.index("torso_link")
-_WRISTS: Final = tuple(LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right"))
+#: Links that carry the palms, left and right.
+WRISTS: Final = [LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right")]
 
 
-def _rotation_constants(rest: Array, axis: Array) -> tuple[Array, Array, Array]:
-    """R0, R0 K and R0 K^2 for each joint, each (J, 3, 3)."""
+def _cross_matrices(axis: Array) -> Array:
+    """K of each axis, (J, 3, 3)."""
     x, y, z = axis.T
     o = np.zeros_like(x)
-    k = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
-    return rest, rest @ k, rest @ k @ k
+    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
 
 
-REST_ROTATION, SIN_ROTATION, COS_ROTATION = _rotation_constants(
-    np.array(_TABLE["rest"]), JOINT_AXIS
-)
+REST_ROTATION: Final[Array] = np.array(_TABLE["rest"])  # (J, 3, 3) R0, R0 K and R0 K^2
+SIN_ROTATION: Final[Array] = REST_ROTATION @ _cross_matrices(JOINT_AXIS)
+COS_ROTATION: Final[Array] = SIN_ROTATION @ _cross_matrices(JOINT_AXIS)
 
 
 #: How far the targets of low-level controllers may leave a joint's range: joint name ending -> rad
@@ -166,5 +165,5 @@ def palm_positions(state: NDArray[np.floating]) -> Array:
     """
     s = np.asarray(state, dtype=np.float64)
     position, rotation = link_transforms(s[:, STATE_SLICES["joint_position"]])
-    palms = position[:, _WRISTS] + rotate(rotation[:, _WRISTS], PALM_OFFSET)
+    palms = position[:, WRISTS] + rotate(rotation[:, WRISTS], PALM_OFFSET)
     return rotate(heading_rotation(s[:, STATE_SLICES["projected_gravity"]])[:, None], palms)

@@ -1,17 +1,13 @@
-"""The G1 as a MuJoCo spec: servos, contact parameters and a choice of foot model.
-
-Needs the ``mujoco`` package (the simulator extra), imported when called.
-"""
+"""The G1 as a MuJoCo spec: servos, contact parameters and a choice of foot model."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
+
+import mujoco
 
 from egovcp.robot.g1 import ARMATURE, DAMPING, EFFORT_LIMIT, STIFFNESS, model_path
 from egovcp.spec import JOINT_NAMES, PHYSICS_DT
-
-if TYPE_CHECKING:
-    import mujoco
 
 FootModel = Literal["stock", "points"]
 
@@ -37,10 +33,10 @@ def robot_spec(feet: FootModel = "stock") -> mujoco.MjSpec:
     conaffinity 1: they collide with scene geoms of contype 1, not with each other. The foot geoms
     (priority 1) determine the friction of their contacts.
     """
-    import mujoco
-
     spec = mujoco.MjSpec.from_file(str(model_path()))
-    _set_options(spec)
+    spec.option.timestep = PHYSICS_DT
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     _add_servos(spec)
     for geom in _collision_geoms(spec):
         geom.contype, geom.conaffinity, geom.condim = 0, 1, 3
@@ -52,18 +48,8 @@ def robot_spec(feet: FootModel = "stock") -> mujoco.MjSpec:
     return spec
 
 
-def _set_options(spec: mujoco.MjSpec) -> None:
-    import mujoco
-
-    spec.option.timestep = PHYSICS_DT
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-
-
 def _add_servos(spec: mujoco.MjSpec) -> None:
     """Torque = kp (target - q) - kd qdot, clipped to the effort limit; rotor inertia."""
-    import mujoco
-
     for i, name in enumerate(JOINT_NAMES):
         spec.joint(name).armature = float(ARMATURE[i])
         limit = float(EFFORT_LIMIT[i])
@@ -84,8 +70,6 @@ def _foot_geoms(spec: mujoco.MjSpec) -> list[mujoco.MjsGeom]:
 
 def _replace_feet(spec: mujoco.MjSpec) -> None:
     """Four spheres per foot instead of seven capsules; names ``left_foot1_collision``.."""
-    import mujoco
-
     for geom in _foot_geoms(spec):
         spec.delete(geom)
     for side in ("left", "right"):

@@ -28,16 +28,7 @@ from egovcp.robot.kinematics import (
     foot_positions,
     torso_rotation,
 )
-from egovcp.robot.stance_table import (
-    NF,
-    NR,
-    NU,
-    NX,
-    NZ,
-    StanceRow,
-    StanceTable,
-    stance_table,
-)
+from egovcp.robot.stance_table import NF, NR, NU, NX, NZ, StanceRow, stance_table
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 LOWER_BODY: Final = slice(0, NU)
@@ -95,9 +86,9 @@ class BalanceState:
         return np.asarray(reference + cross(reference, self.prediction[:, 3:6]))
 
     @classmethod
-    def standing(cls, height: Array, arms: ArmReference, table: StanceTable) -> BalanceState:
+    def standing(cls, height: Array, arms: ArmReference) -> BalanceState:
         """Robots at rest at pelvis heights (B,), m, with these arms."""
-        batch, row = len(height), table.at(height)
+        batch, row = len(height), stance_table().at(height)
         moment = _turn(arms.moment, row.pelvis[:, 2])[:, :2]
         reference = np.zeros((batch, _WIDTH))
         reference[:, _POSITIONS] = _positions(row, height, moment)
@@ -109,6 +100,32 @@ class BalanceState:
             sent=reference,
             reached=reference.copy(),
         )
+
+
+def start_standing(state: Array) -> tuple[BalanceState, ArmReference]:
+    """Robots at rest in the measured postures, (B, 74) observations."""
+    q = state[:, STATE_SLICES["joint_position"]]
+    height = pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
+    arms = ArmReference.at_rest(q[:, ARMS])
+    return BalanceState.standing(stance_table().clamp(height), arms), arms
+
+
+def reach(
+    arms: ArmReference, state: Array, gravity: Array, waist: Array, config: ReachConfig
+) -> Array:
+    """Advance the arms by one tick and return their targets (B, 14), rad.
+
+    Args:
+        arms: advanced in place.
+        state: (B, 74) observations.
+        gravity: (B, 3) unit vector, pelvis frame.
+        waist: (B, 3) yaw, roll and pitch of the waist, rad.
+        config: speeds.
+    """
+    heading = heading_rotation(gravity)
+    hands = state[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
+    relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
+    return track_hands(arms, relative, torso_rotation(heading, waist), config)
 
 
 def follow_height(m: BalanceState, command: Array, config: BalanceConfig) -> None:
@@ -239,21 +256,15 @@ class StanceConfig:
     reach: ReachConfig = field(default_factory=ReachConfig)
 
 
-class G1Controller:
-    """The common part of the controllers of the G1: servo gains and identity."""
-
-    stiffness = STIFFNESS
-    damping = DAMPING
-
-    def _id(self, name: str, parameters: object) -> str:
-        """``name`` and a hash of the parameters, the arms, the stance table and the gains."""
-        digest = hashlib.sha256(repr((parameters, ARM_IDENTITY)).encode())
-        digest.update(stance_table().fingerprint().encode())
-        digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
-        return f"{name}-{digest.hexdigest()[:8]}"
+def identity(name: str, parameters: object) -> str:
+    """``name`` and a hash of the parameters, the arms, the stance table and the gains."""
+    digest = hashlib.sha256(repr((parameters, ARM_IDENTITY)).encode())
+    digest.update(stance_table().fingerprint().encode())
+    digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
+    return f"{name}-{digest.hexdigest()[:8]}"
 
 
-class StanceController(G1Controller):
+class StanceController:
     """`LowLevelController` for two planted feet."""
 
     walks = False
@@ -261,11 +272,11 @@ class StanceController(G1Controller):
     def __init__(self, config: StanceConfig | None = None) -> None:
         self.config = config or StanceConfig()
         self._table = stance_table()
-        self._balance, self._arms = self._start(np.zeros((0, STATE_DIM)))
+        self._balance, self._arms = start_standing(np.zeros((0, STATE_DIM)))
 
     @property
     def id(self) -> str:
-        return self._id("g1-stance-lqr", self.config)
+        return identity("g1-stance-lqr", self.config)
 
     @property
     def stepping(self) -> NDArray[np.bool_]:
@@ -275,18 +286,11 @@ class StanceController(G1Controller):
         """See `LowLevelController`."""
         s = np.asarray(state, dtype=np.float64)
         if rows is None or len(self._balance.height) != len(s):
-            self._balance, self._arms = self._start(s)
+            self._balance, self._arms = start_standing(s)
             return
-        fresh = self._start(s[rows])
-        replace_rows(self._balance, fresh[0], rows)
-        replace_rows(self._arms, fresh[1], rows)
-
-    def _start(self, state: Array) -> tuple[BalanceState, ArmReference]:
-        q = state[:, STATE_SLICES["joint_position"]]
-        height = pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
-        arm_reference = ArmReference.at_rest(q[:, ARMS])
-        balance_state = BalanceState.standing(self._table.clamp(height), arm_reference, self._table)
-        return balance_state, arm_reference
+        standing, arms = start_standing(s[rows])
+        replace_rows(self._balance, standing, rows)
+        replace_rows(self._arms, arms, rows)
 
     def step(self, state: NDArray[np.floating]) -> Array:
         s = np.asarray(state, dtype=np.float64)
@@ -295,11 +299,7 @@ class StanceController(G1Controller):
         m = self._balance
         height = s[:, STATE_SLICES["command_height"]][:, 0]
         follow_height(m, self._table.clamp(height), self.config.balance)
-        heading = heading_rotation(m.gravity)
-        torso = torso_rotation(heading, m.prediction[:, 6:9])
-        hands = s[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
-        relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
-        arm_target = track_hands(self._arms, relative, torso, self.config.reach)
+        arm_target = reach(self._arms, s, m.gravity, m.prediction[:, 6:9], self.config.reach)
         row = self._table.at(m.height)
         body_target = balance(m, s, row, self._arms, self.config.balance)
         target = np.concatenate([body_target, arm_target], axis=1)

@@ -14,9 +14,11 @@ of actuation delay is part of the design: the state is x = [z - z0, z'] (18) and
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
+import mujoco
 import numpy as np
+from scipy.linalg import expm, solve_discrete_are
 
 from egovcp.robot.arms import REST
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
@@ -55,13 +57,6 @@ _FORCE_DECAY: Final = 0.998
 _ANKLE_FACTOR: Final = 5.0
 
 
-def rest_joints() -> Array:
-    """(J,) arms at rest, everything else zero."""
-    q = np.zeros(NUM_JOINTS)
-    q[ARMS] = REST.ravel()
-    return q
-
-
 @dataclass(frozen=True)
 class Pose:
     """A static two-feet stance: model coordinates and the servo torques that hold it."""
@@ -73,10 +68,7 @@ class Pose:
 class StanceModel:
     """The robot on two planted feet."""
 
-    def __init__(self, model: Any) -> None:
-        import mujoco
-
-        self.mj = mujoco
+    def __init__(self, model: mujoco.MjModel) -> None:
         self.model = model
         self.data = mujoco.MjData(model)
         self.feet = [model.body(f"{s}_ankle_roll_link").id for s in ("left", "right")]
@@ -86,14 +78,14 @@ class StanceModel:
         """Set the configuration and compute positions, inertia and bias forces."""
         self.data.qpos[:] = qpos
         self.data.qvel[:] = 0.0
-        self.mj.mj_forward(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
 
     def feet_jacobian(self) -> Array:
         """(12, 35): linear and angular velocity of both ankle-roll frames, world."""
         rows = []
         for foot in self.feet:
             linear, angular = np.zeros((2, 3, self.model.nv))
-            self.mj.mj_jac(self.model, self.data, linear, angular, self.data.xpos[foot], foot)
+            mujoco.mj_jac(self.model, self.data, linear, angular, self.data.xpos[foot], foot)
             rows += [linear, angular]
         return np.concatenate(rows)
 
@@ -102,7 +94,7 @@ class StanceModel:
         out = []
         for foot, target in zip(self.feet, self.target, strict=True):
             turn = np.zeros(3)
-            self.mj.mju_quat2Vel(turn, self.data.xquat[foot], 1.0)
+            mujoco.mju_quat2Vel(turn, self.data.xquat[foot], 1.0)
             out += [self.data.xpos[foot] - target, turn]
         return np.concatenate(out)
 
@@ -132,7 +124,7 @@ class StanceModel:
         velocity = np.zeros(self.model.nv)
         velocity[:6], velocity[18:21] = z[:6], z[6:]
         out = qpos.copy()
-        self.mj.mj_integratePos(self.model, out, velocity, 1.0)
+        mujoco.mj_integratePos(self.model, out, velocity, 1.0)
         return self.plant(out)
 
     def force(self, qpos: Array, target: Array) -> Array:
@@ -145,7 +137,7 @@ class StanceModel:
     def inertia(self) -> Array:
         """(35, 35) mass matrix at the configuration last placed."""
         mass = np.zeros((self.model.nv, self.model.nv))
-        self.mj.mj_fullM(self.model, self.data, mass)
+        mujoco.mj_fullM(self.model, self.data, mass)
         return mass
 
     def com(self) -> Array:
@@ -164,7 +156,7 @@ def upright(height: float, x: float, y: float = 0.0) -> Array:
     pitch = float(pitch_at(height))
     qpos = np.zeros(7 + NUM_JOINTS)
     qpos[:7] = [x, y, height, np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0]
-    qpos[7:] = rest_joints()
+    qpos[7:][ARMS] = REST.ravel()
     bend = np.sqrt(max(0.8 - height, 0.0)) * 1.9
     qpos[[10, 16]] = bend
     qpos[[7, 13]] = -bend / 2 - pitch
@@ -233,8 +225,6 @@ class Linear:
 
 def linearise(stance: StanceModel, pose: Pose) -> Linear:
     """Reduced dynamics at a pose, with an exact zero-order hold over one tick."""
-    from scipy.linalg import expm
-
     spring = _spring(stance, pose)
     stance.place(pose.qpos)
     basis = stance.basis()
@@ -302,8 +292,6 @@ def lqr_gain(linear: Linear) -> tuple[Array, Array, Array]:
     The state is extended by constant forces d, for which the gain finds the cheapest posture, and
     by the delayed input w. Penalised are the servo torques T_x x + T_u w, not the targets.
     """
-    from scipy.linalg import solve_discrete_are
-
     n = NX + NZ + NU
     delayed = slice(NX + NZ, n)
     a, b = np.zeros((n, n)), np.zeros((n, NU))
@@ -343,8 +331,6 @@ def filter_model(linear: Linear) -> tuple[Array, Array, Array]:
 
 def kalman_gain(a: Array, c: Array) -> Array:
     """L (29, 36): steady-state measurement update, from the dual Riccati equation."""
-    from scipy.linalg import solve_discrete_are
-
     r = np.diag(measurement_noise() ** 2)
     process = np.diag(np.concatenate([_DRIFT, _PUSH, np.full(NR, _ROCK), _FORCE]) ** 2)
     p = solve_discrete_are(a.T, c.T, process, r)
@@ -355,14 +341,8 @@ def measurement_noise() -> Array:
     """(36,) standard deviations in the order of ``sensor_matrix``."""
     ankle = np.ones(NU)
     ankle[[4, 5, 10, 11]] = _ANKLE_FACTOR
-    return np.concatenate(
-        [
-            np.full(3, _GRAVITY_NOISE),
-            np.full(3, _GYRO_NOISE),
-            _JOINT_NOISE * ankle,
-            _JOINT_RATE_NOISE * ankle,
-        ]
-    )
+    imu = np.repeat([_GRAVITY_NOISE, _GYRO_NOISE], 3)
+    return np.concatenate([imu, _JOINT_NOISE * ankle, _JOINT_RATE_NOISE * ankle])
 
 
 def compensator(linear: Linear) -> Array:

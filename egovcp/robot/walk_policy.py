@@ -129,7 +129,7 @@ class WalkPolicy:
         if file.metadata.get("schema") != SCHEMA:
             raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
         content = decode(_Content, file.json_metadata("content"), "content")
-        count = sum(name.endswith(".weight") for name in file.tensors)
+        count = sum(name.endswith(".weight") for name in file.shapes)
         names = {f"layers.{i}.{part}" for i in range(count) for part in ("weight", "bias")}
         names |= {"mean", "std"}
         file.require_names(names)

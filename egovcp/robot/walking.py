@@ -18,19 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot import gait
-from egovcp.robot.arms import TORSO_ORIGIN, ArmReference, ReachConfig, track_hands
-from egovcp.robot.g1 import ARMS, WAIST
+from egovcp.robot.arms import ArmReference, ReachConfig
+from egovcp.robot.g1 import WAIST
 from egovcp.robot.gait import Gait, GaitConfig
-from egovcp.robot.geometry import Array, heading_rotation, rotate
-from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW, torso_rotation
+from egovcp.robot.geometry import Array
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.robot.stance import (
     BalanceConfig,
     BalanceState,
-    G1Controller,
     balance,
     follow_height,
-    pelvis_height,
+    identity,
+    reach,
     replace_rows,
+    start_standing,
 )
 from egovcp.robot.stance_table import NU, stance_table
 from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
@@ -102,12 +103,9 @@ class Walk:
             replace_rows(self._memory, self._start(s[rows]), rows)
 
     def _start(self, state: Array) -> _Memory:
-        q = state[:, STATE_SLICES["joint_position"]]
-        gravity = state[:, STATE_SLICES["projected_gravity"]]
-        height, walking = pelvis_height(q, gravity), gait.start(q, gravity)
-        hands = ArmReference.at_rest(q[:, ARMS])
-        standing = BalanceState.standing(self._table.clamp(height), hands, self._table)
-        return _Memory(standing, hands, walking, np.zeros((len(state), ACTIONS)))
+        joints = state[:, STATE_SLICES["joint_position"]]
+        walking = gait.start(joints, state[:, STATE_SLICES["projected_gravity"]])
+        return _Memory(*start_standing(state), walking, np.zeros((len(state), ACTIONS)))
 
     def observe(self, state: NDArray[np.floating]) -> NDArray[np.float32]:
         """(B, 74) measurements -> (B, 95) observations of the policy; the memory advances."""
@@ -162,11 +160,7 @@ class Walk:
             state[:, STATE_SLICES["projected_gravity"]],
             m.balance.gravity,
         )
-        heading = heading_rotation(gravity)
-        torso = torso_rotation(heading, waist)
-        hands = state[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
-        relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
-        return track_hands(m.arms, relative, torso, self.config.reach)
+        return reach(m.arms, state, gravity, waist, self.config.reach)
 
     def _restart_standing(self, which: NDArray[np.bool_]) -> None:
         """Restart the stance law's filter, which assumes planted feet, after steps."""
@@ -177,12 +171,12 @@ class Walk:
         hands = ArmReference(
             *(getattr(self._memory.arms, n)[rows] for n in ("goal", "joints", "rate"))
         )
-        fresh = BalanceState.standing(m.height[rows], hands, self._table)
+        fresh = BalanceState.standing(m.height[rows], hands)
         fresh.height_rate = m.height_rate[rows]
         replace_rows(m, fresh, rows)
 
 
-class WalkingController(G1Controller):
+class WalkingController:
     """`LowLevelController` that stands, squats, reaches and walks."""
 
     walks = True
@@ -194,7 +188,7 @@ class WalkingController(G1Controller):
 
     @property
     def id(self) -> str:
-        return self._id("g1-walk-ppo", self._policy.digest)
+        return identity("g1-walk-ppo", self._policy.digest)
 
     @property
     def stepping(self) -> NDArray[np.bool_]:

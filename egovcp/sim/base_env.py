@@ -210,11 +210,10 @@ class BaseVectorEnv(ABC):
         """Start an episode in every row."""
         if len(scenarios) != self.num_envs:
             raise UsageError(f"expected {self.num_envs} scenarios, found {len(scenarios)}")
+        if self.instances:
+            return self.reset_rows(range(self.num_envs), scenarios)
         self._check(scenarios)
-        if not self.instances:
-            self.instances = [self._instance(scenario) for scenario in scenarios]
-        else:
-            self._start_instances(range(self.num_envs), scenarios)
+        self.instances = [self._instance(scenario) for scenario in scenarios]
         return self._begin(None)
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
@@ -224,12 +223,9 @@ class BaseVectorEnv(ABC):
         if len(rows) != len(scenarios):
             raise UsageError(f"expected {len(rows)} scenarios, found {len(scenarios)}")
         self._check(scenarios)
-        self._start_instances(rows, scenarios)
-        return self._begin(np.asarray(rows, dtype=np.intp))
-
-    def _start_instances(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
         for row, scenario in zip(rows, scenarios, strict=True):
             self.instances[row].start(scenario)
+        return self._begin(np.asarray(rows, dtype=np.intp))
 
     def _send(self, action: NDArray[np.floating], live: NDArray[np.bool_]) -> None:
         """Limit the rate, clip to the box, and queue the action."""

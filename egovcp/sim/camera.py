@@ -175,14 +175,9 @@ class DepthNoise:
         lost = chance < np.where(edge, self._edges + self._holes, self._holes)
         noise *= self._per_z2 * depth * depth
         noise += depth
-        return quantise(np.where(lost, np.float32(0), noise))
-
-
-def quantise(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Metres -> whole millimetres, 0 for what the camera cannot measure."""
-    millimetres = within_range(depth)
-    millimetres *= 1000.0
-    return np.rint(millimetres, out=millimetres).astype(np.uint16)
+        measured = within_range(np.where(lost, np.float32(0), noise))
+        measured *= 1000.0
+        return np.rint(measured, out=measured).astype(np.uint16)
 
 
 def discontinuity(depth: NDArray[np.float32], ratio: np.float32) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ steps of 5 ms under the joint targets.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -29,7 +29,6 @@ from egovcp.spec import (
     DEPTH_MAX_M,
     DEPTH_ROWS,
     STATE_DIM,
-    Solid,
 )
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PrivilegedState:
-    """Simulator state of all rows, for oracles, probes and logs, never for a policy.
+    """Simulator state of all rows, for studies, never for a policy.
 
     ``_w``: world, ``_b``: pelvis heading frame.
     """
@@ -50,45 +49,15 @@ class PrivilegedState:
     pelvis_w: Array  # (B, 7) position m, quaternion wxyz
     pelvis_velocity_w: Array  # (B, 3) m/s
     hands_b: Array  # (B, 2, 3) palm sites, m
-    object_w: Array  # (B, 3) position of the task's object, m; NaN: there is none
-    object_b: Array  # (B, 3) the same, m
-    object_velocity_w: Array  # (B, 3) m/s
-    object_active: NDArray[np.bool_]  # (B,) the robot has to act now
-    contact_force: Array
-    """(B, parts) peak force between each of ``scene.PARTS`` and the object in the last
-    planner tick, N."""
-    solids: tuple[tuple[Solid, ...], ...]  # Per row, the objects in the scene
+    object_b: Array  # (B, 3) position of the task's object, m; NaN: there is none
 
 
-def privileged_state(instances: Sequence[EnvInstance]) -> PrivilegedState:
-    """The state of all rows."""
-    states = [i.task.state() for i in instances]
-    datas = [i.robot.data for i in instances]
-    position = np.array([state.position_w for state in states])
-    hands = np.array([i.robot.palms_w for i in instances])
-    heading = np.array([i.robot.heading for i in instances])
-    pelvis = np.array([data.qpos[:7] for data in datas])
-    return PrivilegedState(
-        since_event=np.array([i.task.since_event for i in instances]),
-        pelvis_w=pelvis,
-        pelvis_velocity_w=np.array([data.qvel[:3] for data in datas]),
-        hands_b=np.einsum("bhi,bij->bhj", hands - pelvis[:, None, :3], heading),
-        object_w=position,
-        object_b=np.einsum("bi,bij->bj", position - pelvis[:, :3], heading),
-        object_velocity_w=np.array([state.velocity_w for state in states]),
-        object_active=np.array([state.active for state in states]),
-        contact_force=np.array([i.task.forces for i in instances]),
-        solids=tuple(i.task.solids() for i in instances),
-    )
-
-
-def resolve_config(config: EnvConfig, tasks: Iterable[str] = ()) -> EnvConfig:
+def resolve_config(config: EnvConfig, tasks: Sequence[str]) -> EnvConfig:
     """``config`` with the path of its controller's file made absolute.
 
     Raises:
         UsageError: the controller does not suit one of ``tasks``.
     """
-    tasks = tuple(tasks)
     if tasks and not one_robot(tasks).is_g1:
         return config
     walks = make_controller(config.controller).walks
@@ -200,8 +169,16 @@ class VectorEnv(BaseVectorEnv):
         return bool(0.0 < position[0] < DEPTH_MAX_M)  # in front of the pelvis; false for NaN
 
     def privileged_state(self) -> PrivilegedState:
-        """The simulator's state now, for oracles, probes and logs, never for a policy."""
-        return privileged_state(self.instances)
+        """The simulator's state now."""
+        robots = [instance.robot for instance in self.instances]
+        tasks = [instance.task for instance in self.instances]
+        return PrivilegedState(
+            since_event=np.array([task.since_event for task in tasks]),
+            pelvis_w=np.array([robot.data.qpos[:7] for robot in robots]),
+            pelvis_velocity_w=np.array([robot.data.qvel[:3] for robot in robots]),
+            hands_b=np.array([robot.palms_b for robot in robots]),
+            object_b=np.array([task.object_b for task in tasks]),
+        )
 
     def close(self) -> None:
         """End the threads."""

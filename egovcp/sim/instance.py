@@ -244,14 +244,12 @@ class EnvInstance(BaseInstance):
             return
         scenario = self.scenario
         scene = ", ".join(f"{name}={value:.3g}" for name, value in self.task.parameters.items())
-        error = SimulationDiverged(
+        raise SimulationDiverged(
             f"the simulation diverged in task {scenario.task}, seed {scenario.seed}, episode "
             f"{scenario.episode}, after {self.task.time:.2f} s: {self.robot.divergence}; the scene "
             f"is {scene}; choose narrower ranges of --env.{self.task.current_name} or "
             "--env.randomise"
         )
-        error.episode = scenario.episode
-        raise error
 
     def _sense(self) -> None:
         self.robot.refresh_poses()

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -230,9 +231,7 @@ class LiveRobot:
 
     def _pose(self) -> Array:
         """(7,) the action that commands the robot's present pose, box units."""
-        robot = self.robot
-        hands = (robot.palms_w - robot.data.qpos[:3]) @ robot.heading
-        pose = np.append(hands.ravel(), robot.pelvis_height)
+        pose = np.append(self.robot.palms_b.ravel(), self.robot.pelvis_height)
         return np.clip(ACTION_BOX.to_normalised(pose), -1.0, 1.0)
 
     def measure(self) -> Measurement:
@@ -267,14 +266,7 @@ def _tilted(quaternion: Array, rotation: Array, gravity: Array) -> Array:
     For unit vectors near each other, measured g' and true g in the pelvis frame, the rotation
     vector is g' x g.
     """
-    w, x, y, z = quaternion.tolist()
-    a, b, c = (np.cross(gravity, -rotation[2]) / 2.0).tolist()
-    out = np.array(
-        [
-            w - x * a - y * b - z * c,
-            x + w * a + y * c - z * b,
-            y + w * b + z * a - x * c,
-            z + w * c + x * b - y * a,
-        ]
-    )
+    turn = np.array([1.0, *(np.cross(gravity, -rotation[2]) / 2.0)])
+    out = np.empty(4)
+    mujoco.mju_mulQuat(out, quaternion, turn)
     return np.asarray(out / np.linalg.norm(out))

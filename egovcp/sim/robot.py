@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -45,7 +46,7 @@ class SimulatedRobot:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.index = scene.index
-        self.model = scene.copy_model()
+        self.model = copy.copy(scene.model)
         self.data = mujoco.MjData(self.model)
         self._wrench = np.zeros(6)
 
@@ -157,9 +158,10 @@ class SimulatedRobot:
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     @property
-    def palms_w(self) -> Array:
-        """(2, 3) palm sites, left and right, m."""
-        return np.array(self.data.site_xpos[self.index.palm_sites])
+    def palms_b(self) -> Array:
+        """(2, 3) palm sites, left and right, m, pelvis heading frame."""
+        palms = self.data.site_xpos[self.index.palm_sites] - self.data.qpos[:3]
+        return np.asarray(palms @ self.heading)
 
     @property
     def on_floor(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import SimulationDiverged, UsageError
+from egovcp.errors import SimulationDiverged
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.base_env import BaseInstance, BaseVectorEnv, Observation, StepResult, one_robot
 from egovcp.sim.env import VectorEnv
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
 
 
-def make_env(
-    config: EnvConfig, num_envs: int, tasks: Iterable[str], render_depth: bool = True
-) -> BaseVectorEnv:
+def make_env(config: EnvConfig, num_envs: int, tasks: Iterable[str]) -> BaseVectorEnv:
     """The environment of the robot of ``tasks``; see `VectorEnv` and `RobotEnv`.
 
     Raises:
@@ -32,8 +30,8 @@ def make_env(
     """
     names = tuple(tasks)
     if one_robot(names).is_g1:
-        return VectorEnv(config, num_envs, render_depth=render_depth)
-    return RobotEnv(config, num_envs, robot_class(names[0]), render_depth)
+        return VectorEnv(config, num_envs)
+    return RobotEnv(config, num_envs, _robot_class(names[0]))
 
 
 def controller_id_of(config: EnvConfig, tasks: Iterable[str]) -> str:
@@ -45,32 +43,24 @@ def controller_id_of(config: EnvConfig, tasks: Iterable[str]) -> str:
     names = tuple(tasks)
     if one_robot(names).is_g1:
         return make_controller(config.controller).id
-    return robot_class(names[0]).control_id
+    return _robot_class(names[0]).control_id
 
 
-def robot_class(task: str) -> type[MujocoRobot]:
-    """The robot of a `RobotTask`; raises `UsageError` if ``task`` is of another class."""
-    kind = find_task(task)
-    if not issubclass(kind, RobotTask):
-        raise UsageError(
-            f"task {task}: {kind.__name__} is of robot {kind.robot_spec().robot_type}, but not a "
-            "subclass of egovcp.sim.tasks.RobotTask; make it one"
-        )
-    return kind.robot_class
+def _robot_class(task: str) -> type[MujocoRobot]:
+    return cast(type[RobotTask], find_task(task)).robot_class
 
 
 class RobotInstance(BaseInstance):
     """One robot in one episode at a time; all randomness comes from the scenario."""
 
-    def __init__(self, config: EnvConfig, scenario: Scenario, render_depth: bool) -> None:
-        self._config, self._renders = config, render_depth
+    def __init__(self, config: EnvConfig, scenario: Scenario) -> None:
+        self._config = config
         self.start(scenario)
 
     def start(self, scenario: Scenario) -> None:
         """Begin the episode of ``scenario``."""
         self.scenario = scenario
-        kind = find_task(scenario.task)
-        assert issubclass(kind, RobotTask), "checked by the environment"
+        kind = cast(type[RobotTask], find_task(scenario.task))
         # a fresh copy, because a task may edit the model
         self.robot = kind.robot_class(copy.copy(kind.scene()))
         self.robot.reset(scenario.rng("robot"))
@@ -94,20 +84,17 @@ class RobotInstance(BaseInstance):
         for _ in range(self.task.physics_clock()[1]):
             self.task.step()
         if self.robot.diverged:
-            error = SimulationDiverged(
+            raise SimulationDiverged(
                 f"the simulation diverged in task {self.scenario.task}, seed {self.scenario.seed}, "
                 f"episode {self.scenario.episode}, after {self.task.time:.2f} s; choose a smaller "
                 "timestep, softer actuators, or narrower ranges of the task"
             )
-            error.episode = self.scenario.episode
-            raise error
         self.robot.forward()
         self._sense()
 
     def _sense(self) -> None:
         self.state = np.asarray(self.robot.state(), np.float64)
-        shape = self.robot.spec.depth
-        self.depth = self.robot.depth() if self._renders else np.zeros(shape, np.uint16)
+        self.depth = self.robot.depth()
 
     @property
     def base_pose(self) -> Array:
@@ -116,21 +103,11 @@ class RobotInstance(BaseInstance):
 
 
 class RobotEnv(BaseVectorEnv):
-    """B robots of one `MujocoRobot` class, each in its own episode of any of its tasks.
+    """B robots of one `MujocoRobot` class, each in its own episode of any of its tasks."""
 
-    Args:
-        render_depth: if false, depth images are zero, which is faster; all else is the same.
-    """
-
-    def __init__(
-        self,
-        config: EnvConfig,
-        num_envs: int,
-        robot: type[MujocoRobot],
-        render_depth: bool = True,
-    ) -> None:
+    def __init__(self, config: EnvConfig, num_envs: int, robot: type[MujocoRobot]) -> None:
         super().__init__(config, num_envs, robot.spec)
-        self._class, self._render_depth = robot, render_depth
+        self._class = robot
 
     @property
     def controller_id(self) -> str:
@@ -138,7 +115,7 @@ class RobotEnv(BaseVectorEnv):
         return self._class.control_id
 
     def _instance(self, scenario: Scenario) -> RobotInstance:
-        return RobotInstance(self.config, scenario, self._render_depth)
+        return RobotInstance(self.config, scenario)
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, A) per row and let a planner tick pass."""

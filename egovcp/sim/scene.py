@@ -8,7 +8,6 @@ Geom groups: 0 floor and objects, 3 robot. Robot geoms meet the geoms with conty
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -87,10 +86,6 @@ class Scene:
 
     model: mujoco.MjModel
     index: SceneIndex
-
-    def copy_model(self) -> mujoco.MjModel:
-        """A copy for one robot, to be edited per episode."""
-        return copy.copy(self.model)
 
 
 @cache

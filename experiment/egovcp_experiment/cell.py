@@ -8,13 +8,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
-from egovcp.errors import UsageError
 from egovcp.files import sha256
 from egovcp.manifest import MANIFEST, SEAL, read_manifest
 from egovcp.reactive import ReactiveNetwork
@@ -121,22 +121,6 @@ def to_argv(flags: Flags) -> list[str]:
     return [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in flags.items()]
 
 
-def in_order(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """The cells without duplicates.
-
-    Raises:
-        UsageError: two different cells share a name, or a cell comes before one that it needs.
-    """
-    known: dict[str, Cell] = {}
-    for cell in cells:
-        if known.setdefault(cell.name, cell) != cell:
-            raise UsageError(f"two different cells are called {cell.name}")
-        for name in cell.needs:
-            if name not in known:
-                raise UsageError(f"cell {cell.name} needs {name}, which does not come before it")
-    return tuple(known.values())
-
-
 def read_json(path: Path) -> Any:
     """The content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
@@ -241,6 +225,7 @@ PLAY: Final = CellCommand(
 )
 
 
+@cache
 def study(name: str, exclusive: bool = False) -> CellCommand:
     """The study ``egovcp_experiment.studies.NAME``."""
     module = f"egovcp_experiment.studies.{name}"

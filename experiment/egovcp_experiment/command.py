@@ -13,12 +13,12 @@ import draccus
 from egovcp.artifact import load_artifact
 from egovcp.cli import given_options
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.errors import EgovcpError, UsageError, suggest
+from egovcp.errors import EgovcpError, UsageError
 from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
-from egovcp_experiment.config import SCALES, ExperimentConfig
+from egovcp_experiment.config import SCALES, ExperimentConfig, small
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report import publish
 from egovcp_experiment.scheduler import CellScheduler
@@ -29,15 +29,13 @@ def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
     """Defaults of all options: the configuration of the scale in ``argv``.
 
     Raises:
-        UsageError: the scale is unknown, or a config file would override it.
+        UsageError: a config file would override it.
     """
     given = given_options(argv)
     if "config_path" in given:
         raise UsageError("--config_path would hide the scale; give single options as flags")
-    name = given.get("scale", ExperimentConfig().scale)
-    if name not in SCALES:
-        raise UsageError(f"unknown value --scale={name}{suggest(name, SCALES)}")
-    encoded: dict[str, Any] = draccus.encode(SCALES[name]())
+    scale = SCALES.get(given.get("scale", ""), small)  # the parser refuses an unknown one
+    encoded: dict[str, Any] = draccus.encode(scale())
     return encoded
 
 
@@ -62,7 +60,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
         scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records
         for command in dict.fromkeys(c.command for c in cells if c.name not in records):
-            require_packages("egovcp-experiment", command.prog, *command.packages)
+            require_packages("egovcp-train", command.prog, *command.packages)
         echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete")
         try:
             scheduler.run()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import bounded, check_bounds, require_cores
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.errors import UsageError, suggest
 
 #: The paper's tasks.
@@ -140,7 +140,7 @@ class ExperimentConfig:
     """Folder of cells and reports; experiments with the same options can share it."""
     scale: Literal["smoke", "small", "paper"] = "small"
     """smoke: minutes, metrics without meaning; small: hours on two cores; paper: the paper's."""
-    jobs: int = bounded(1, least=1, most=1024)
+    jobs: int = bounded(1, least=1, per_core=MAX_PER_CORE)
     """Cells that run at the same time, each on its share of the CPU cores."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to learn and play."""
@@ -163,8 +163,6 @@ class ExperimentConfig:
         """Raise `UsageError` for invalid values."""
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
-        check_bounds(self, "--")
-        require_cores("--jobs", self.jobs)
         for option, given, known in (
             ("tasks", self.tasks, TASKS),
             ("data.roots", self.data.roots, TASKS),

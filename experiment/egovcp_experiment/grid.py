@@ -3,8 +3,7 @@
 collect-TASK-COUNT
 train-TASK-MODEL-sSEED     on the data of a task, or with the task `all` on that of all tasks
 play-TASK-VARIANT-sSEED    the planner with that model; `default` without changed flags
-references-TASK            hold, constant, random and oracle on the same scenarios
-bounds-TASK                the same without constant, which needs an expensive search
+references-TASK            hold, random and oracle on the same scenarios
 """
 
 from __future__ import annotations
@@ -33,10 +32,8 @@ ALL: Final = "all"
 DEFAULT: Final = "default"
 #: Name of the variant of the model of all tasks without changed flags.
 MIXED: Final = "mixed"
-#: Controllers of egovcp-eval that need no model.
-REFERENCES: Final = ("hold", "constant", "random", "oracle")
-#: References without a search.
-BOUNDS: Final = ("hold", "random", "oracle")
+#: Controllers of egovcp-eval that need neither a model nor a search.
+REFERENCES: Final = ("hold", "random", "oracle")
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,8 @@ class Grid:
 
     def add(self, cell: Cell) -> Cell:
         """Add a cell; those it needs come before."""
-        self._cells.setdefault(cell.name, cell)
+        known = self._cells.setdefault(cell.name, cell)
+        assert known == cell, f"two different cells are called {cell.name}"
         return cell
 
     def episodes(self, task: str, share: float = 1.0) -> int:
@@ -148,14 +146,10 @@ class Grid:
         scene: Flags | None = None,
         controllers: Sequence[str] = REFERENCES,
     ) -> str:
-        """Name of the cell of controllers that need no model, on the planner's scenarios in a
-        changed ``scene``."""
+        """Name of the cell of reference controllers, on the planner's scenarios in a changed
+        ``scene``."""
         flags = {**self.scenarios(task), "controllers": ",".join(controllers), **(scene or {})}
         return self.add(Cell(name or f"references-{task}", PLAY, flags)).name
-
-    def bounds(self, task: str) -> str:
-        """Name of the cell of `BOUNDS`."""
-        return self.references(task, f"bounds-{task}", controllers=BOUNDS)
 
     def study(
         self, name: str, task: str, flags: Flags, extra: Sequence[str] = (), exclusive: bool = False

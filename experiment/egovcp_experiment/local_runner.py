@@ -62,7 +62,7 @@ class CellProcess:
                 start_new_session=True,  # the scheduler handles Ctrl-C
                 env=os.environ | {"PYTHONUNBUFFERED": "1"},
             )
-        if jobs > 1 and hasattr(os, "sched_setaffinity"):
+        if jobs > 1:
             cores = sorted(os.sched_getaffinity(0))
             with suppress(OSError):  # it may have ended already
                 os.sched_setaffinity(self._process.pid, cores[slot::jobs] or cores)

@@ -11,7 +11,7 @@ from typing import Final
 from egovcp.entry_point import INTERRUPTED
 from egovcp.errors import EnvironmentFailure
 from egovcp.workers import stop_on_signal
-from egovcp_experiment.cell import Cell, in_order
+from egovcp_experiment.cell import Cell
 from egovcp_experiment.local_runner import CellProcess, machine
 from egovcp_experiment.store import CellStore
 
@@ -32,8 +32,7 @@ class CellScheduler:
     def __init__(
         self, cells: Sequence[Cell], store: CellStore, jobs: int, log: Callable[[str], None]
     ) -> None:
-        self._cells = in_order(cells)
-        self._store, self._jobs, self._log = store, jobs, log
+        self._cells, self._store, self._jobs, self._log = cells, store, jobs, log
         self.records = store.records
         self.failed: dict[str, str] = {}
         self._running: list[CellProcess] = []

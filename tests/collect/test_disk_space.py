@@ -12,8 +12,9 @@ import pytest
 from egovcp.data import open_dataset
 from egovcp.data.committer import work_folder
 from egovcp.data.metadata import verify_hashes
-from egovcp.data.staging import StagedEpisode, encode
+from egovcp.data.staging import encode, to_bytes
 from egovcp.errors import EnvironmentFailure
+from egovcp.robot_spec import G1
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks import task_names
@@ -29,16 +30,15 @@ def _free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=free))
 
 
-def test_staged_frame_bytes_match_a_staged_episode() -> None:
-    ticks = 100
-    sealed = len(StagedEpisode.of(0, encode(random_episode(0, ticks))).payload)
-    assert ticks * collect.STAGED_FRAME_BYTES < sealed < 1.05 * ticks * collect.STAGED_FRAME_BYTES
+def test_frame_bytes_match_a_staged_episode() -> None:
+    raw = 100 * collect.frame_bytes(G1)
+    assert raw < to_bytes(encode(random_episode(0, 100))).size < 1.05 * raw
 
 
 @pytest.mark.parametrize("shard", [1, 3, 100])
 def test_needed_bytes_lie_between_compressed_and_uncompressed_size(shard: int) -> None:
     env = EnvConfig()
-    raw = collect.STAGED_FRAME_BYTES * sum(env.episode(s.task).ticks for s in _SCENARIOS)
+    raw = collect.frame_bytes(G1) * sum(env.episode(s.task).ticks for s in _SCENARIOS)
     needed = collect.min_bytes(_SCENARIOS, env, shard)
     assert collect.MIN_COMPRESSED_SHARE * raw < needed <= raw
     assert needed < collect.min_bytes([*_SCENARIOS, _SCENARIOS[0]], env, shard)

@@ -1,19 +1,15 @@
 """Workers that die, hang and fail: the pool finishes every episode."""
 
-import copy
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from multiprocessing import Pipe
 
-import numpy as np
 import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp.testing import random_episode
-from egovcp_collect.worker_pool import MAX_ATTEMPTS, WorkerPool
-from egovcp_collect.workers import WorkerReport, encode_episode, picklable
+from egovcp_collect.worker_pool import MAX_ATTEMPTS, WorkerPool, WorkerReport
 
 _NUM_ENVS = 2
 
@@ -133,73 +129,14 @@ def test_an_episode_that_always_hangs_raises() -> None:
         _run(behaviour)
 
 
-def test_an_invalid_episode_is_repeated_once() -> None:
-    broken = DataError("episode 7, frame 3: state is not finite")
-    numbers, started = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
-    assert sorted(numbers) == list(range(20))
-    assert len(started) == 3
-
-
-def test_an_episode_that_stays_invalid_raises() -> None:
-    broken = DataError("episode 7, frame 3: state is not finite")
-
-    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
-        return WorkerReport(0, error=broken) if number == 7 else None
-
-    with pytest.raises(DataError, match="episode 7, frame 3"):
-        _run(behaviour)
-
-
-def _invalid(number: int) -> DataError:
-    error = DataError(f"episode {number}, frame 3: state is not finite")
-    error.episode = number
-    return error
-
-
-def test_invalid_episodes_of_one_worker_are_counted_separately() -> None:
-    """Two episodes of one worker are invalid once each."""
-    failed: list[int] = []
-
-    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
-        if number not in (6, 7) or number in failed:
-            return None
-        failed.append(number)
-        return WorkerReport(0, error=_invalid(number))
-
-    numbers, started = _run(behaviour, workers=1)
-    assert sorted(numbers) == list(range(20))
-    assert len(started) == 3
-
-
-def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
-    """An episode is invalid once after its worker died once."""
-    faults: list[str] = []
-
-    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
-        if number != 7 or len(faults) == 2:
-            return None
-        faults.append("death" if not faults else "invalid")
-        if len(faults) == 2:
-            return WorkerReport(0, error=_invalid(7))
-        worker.alive = False
-        return None
-
-    numbers, started = _run(behaviour)
-    assert sorted(numbers) == list(range(20))
-    assert len(started) == 4
-
-
-def test_the_number_of_an_invalid_episode_is_pickled_with_the_error() -> None:
-    episode = random_episode(7)
-    episode.state[3, 0] = np.nan
-    with pytest.raises(DataError, match="episode 7, frame 3") as caught:
-        encode_episode(7, episode)
-    arrived = copy.copy(picklable(caught.value))  # copies as pickle does
-    assert isinstance(arrived, DataError)
-    assert (arrived.episode, str(arrived)) == (7, str(caught.value))
-
-
-@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RuntimeError("bug")])
-def test_other_errors_are_raised_at_once(failure: Exception) -> None:
+@pytest.mark.parametrize(
+    "failure",
+    [
+        OSError(28, "No space left on device"),
+        DataError("episode 7, frame 3: state is not finite"),
+        RuntimeError("bug"),
+    ],
+)
+def test_errors_of_workers_are_raised_at_once(failure: Exception) -> None:
     with pytest.raises(type(failure)):
         _run(_once(lambda worker: WorkerReport(0, error=failure), 7))

@@ -81,13 +81,21 @@ def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: s
 def test_constant_json_is_read_back(tmp_path: Path) -> None:
     entry = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
     path = tmp_path / "constant.json"
-    path.write_text(json.dumps({"ball": entry}))
+    path.write_text(json.dumps({"constants": {"ball": entry}}))
     assert load_constants(path, {})["ball"].action == (0.1,) * ACTION_DIM
 
 
 @pytest.mark.parametrize(
     "content",
-    [None, "not json", "[1]", '{"ball": 3}', '{"ball": {"action": [1, 2]}}', '{"ball": {"a": 0}}'],
+    [
+        None,
+        "not json",
+        "[1]",
+        '{"ball": {}}',
+        '{"constants": {"ball": 3}}',
+        '{"constants": {"ball": {"action": [1, 2]}}}',
+        '{"constants": {"ball": {"a": 0}}}',
+    ],
 )
 def test_a_file_of_another_format_is_refused(tmp_path: Path, content: str | None) -> None:
     path = tmp_path / "constant.json"

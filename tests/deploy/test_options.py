@@ -38,7 +38,7 @@ def test_missing_flag_and_file_in_the_way_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="is a file"):
         make_output_dir(str(tmp_path / "file"))
-    with pytest.raises(EnvironmentFailure, match="cannot create"):
+    with pytest.raises(EnvironmentFailure, match="cannot write to"):
         make_output_dir(str(tmp_path / "file" / "below"))
     with pytest.raises(UsageError, match="missing"):
         make_output_dir("")

@@ -105,12 +105,6 @@ def test_brackets_in_strings_do_not_count(tmp_path: Path) -> None:
     files.read_json(path)
 
 
-def test_nan_can_be_allowed(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("[NaN, 1e999]")
-    assert files.read_json(path, allow_nan=True)[1] == float("inf")
-
-
 def test_other_encodings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(b'{"a": "\xff"}')

@@ -16,14 +16,12 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give fi
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A cache folder that holds one file."""
-    with TrustedCache(tmp_path / "cache" / "egovcp") as cache:
-        cache.write(NAME, CONTENT)
+    TrustedCache(tmp_path / "cache" / "egovcp").write(NAME, CONTENT)
     return tmp_path / "cache" / "egovcp"
 
 
 def _read(folder: Path) -> bytes | None:
-    with TrustedCache(folder) as cache:
-        return cache.read(NAME)
+    return TrustedCache(folder).read(NAME)
 
 
 def _flip_a_bit(file: Path) -> None:
@@ -71,8 +69,7 @@ def test_a_damaged_file_is_not_read_and_can_be_replaced(damage: object, folder: 
     assert callable(damage)
     damage(folder / NAME)
     assert _read(folder) is None
-    with TrustedCache(folder) as cache:
-        cache.write(NAME, CONTENT)
+    TrustedCache(folder).write(NAME, CONTENT)
     assert _read(folder) == CONTENT
     assert len(list(folder.iterdir())) == 2, "temporary files were left"
 
@@ -84,8 +81,7 @@ def test_data_is_synchronised_before_the_rename(
     fsync, rename = os.fsync, os.rename
     monkeypatch.setattr(os, "fsync", lambda file: (calls.append("fsync"), fsync(file)))
     monkeypatch.setattr(os, "rename", lambda *a, **k: (calls.append("rename"), rename(*a, **k)))
-    with TrustedCache(folder) as cache:
-        cache.write(NAME, CONTENT)
+    TrustedCache(folder).write(NAME, CONTENT)
     assert calls == ["fsync", "rename", "fsync", "rename", "fsync"]
 
 
@@ -96,8 +92,8 @@ def test_a_write_that_fails_leaves_the_older_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", fail)
-    with TrustedCache(folder) as cache, pytest.raises(OSError, match="No space"):
-        cache.write(NAME, b"newer")
+    with pytest.raises(OSError, match="No space"):
+        TrustedCache(folder).write(NAME, b"newer")
     assert _read(folder) == CONTENT
     assert len(list(folder.iterdir())) == 2
 

@@ -22,7 +22,6 @@ from egovcp_experiment.cell import (
     CellFigure,
     CellOutput,
     ExternalPath,
-    in_order,
     resolve,
     to_argv,
 )
@@ -40,7 +39,7 @@ from egovcp_experiment.studies.residuals import ResidualsConfig
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
     "egovcp_train.train": ("egovcp_train.config", "TrainConfig"),
-    "egovcp_train.ppo.train": ("egovcp_train.ppo.config", "PpoTrainConfig"),
+    "egovcp_train.ppo.train": ("egovcp_train.ppo.train", "PpoTrainConfig"),
     "egovcp_deploy.evaluate": ("egovcp_deploy.evaluate", "EvalConfig"),
 }
 
@@ -56,7 +55,14 @@ def test_variants_share_data_and_models() -> None:
     grid.plays("ball", "other", model=Model("other", {"policy.hidden": 64}))
     commands = [cell.command for cell in grid.cells]
     assert (commands.count(COLLECT), commands.count(TRAIN), commands.count(PLAY)) == (1, 4, 6)
-    assert in_order(grid.cells) == tuple(grid.cells)
+
+
+def test_every_cell_comes_after_those_it_needs() -> None:
+    for make, experiment in product(SCALES.values(), EXPERIMENTS.values()):
+        before: set[str] = set()
+        for cell in experiment.cells(make()):
+            assert before.issuperset(cell.needs), cell.name
+            before.add(cell.name)
 
 
 def test_all_experiments_share_the_default_evaluation() -> None:
@@ -132,7 +138,7 @@ def test_every_command_accepts_the_flags_of_its_cells() -> None:
     trainings: dict[frozenset[str], list[str]] = {}
     commands: dict[str, Cell] = {}
     for make, experiment in product(SCALES.values(), EXPERIMENTS.values()):
-        for cell in in_order(experiment.cells(make())):
+        for cell in experiment.cells(make()):
             commands[cell.command.module] = cell
             argv = [*to_argv(resolve(cell.flags, _any)), *cell.extra]
             if cell.command is TRAIN:

@@ -157,11 +157,3 @@ def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
         CellStore(tmp_path).locked(),
     ):
         pass
-
-
-def test_cells_out_of_order_or_in_conflict_are_refused(cell: MakeCell, tmp_path: Path) -> None:
-    a, b, _ = chain(cell)
-    with pytest.raises(UsageError, match="b needs a, which does not come before it"):
-        run([b, a], tmp_path / "out")
-    with pytest.raises(UsageError, match="two different cells are called a"):
-        run([a, cell("a", add=7)], tmp_path / "out")

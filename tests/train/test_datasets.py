@@ -39,8 +39,8 @@ def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Pa
     assert main(mixed(resumed, "--sampling.tasks={ball: 2}", "--steps=3")) == 0
     assert main([f"--output_dir={resumed}", "--resume", "--steps=6"]) == 0
     one, two = load_training_state(straight), load_training_state(resumed)
-    assert one["streams"] == two["streams"]
-    assert one["streams"][0]["mix"] == {"datasets": [2.0, 1.0], "tasks": {"ball": 2.0}}
+    assert one["stream"] == two["stream"]
+    assert one["stream"]["mix"] == {"datasets": [2.0, 1.0], "tasks": {"ball": 2.0}}
     artifact = load_artifact(str(straight / "checkpoints" / "last" / "pretrained_model"))
     assert len(artifact.manifest["datasets"]) == 2
     assert all(torch.isfinite(w).all() for w in two["learner"]["model"].values())
@@ -98,7 +98,7 @@ def test_a_run_from_the_disk_is_resumed_exactly(arguments: Arguments, tmp_path: 
         flags = [f"--output_dir={tmp_path / 'resumed'}", "--resume", f"--steps={steps}"]
         assert main(flags) == 0
     one, two = (load_training_state(tmp_path / name) for name in ("straight", "resumed"))
-    assert one["streams"] == two["streams"]
+    assert one["stream"] == two["stream"]
 
 
 def test_the_statistics_from_the_disk_are_those_from_memory(

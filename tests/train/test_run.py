@@ -240,7 +240,7 @@ def test_several_processes_are_refused(
         ({"batch_size": 0}, "--batch_size"),
         ({"save_freq": 0}, "--save_freq"),
         ({"device": "abacus"}, "--device"),
-        ({"mixed_precision": "fp8"}, "--mixed_precision=fp8; expected no, bf16 or auto"),
+        ({"mixed_precision": "fp8"}, "--mixed_precision=fp8: expected no or bf16 or auto"),
         ({"preset": "huge"}, "unknown --preset=huge"),
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),

@@ -107,7 +107,7 @@ def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
     assert main(streamed(tmp_path / "streamed", steps=3)) == 0
     window = {"loading__mode": "stream", "loading__shuffle__episodes": 2}
     assert main(arguments(tmp_path / "disk", dataset__root=many_files, steps=3, **window)) == 0
-    streams = [load_training_state(tmp_path / name)["streams"][0] for name in ("streamed", "disk")]
+    streams = [load_training_state(tmp_path / name)["stream"] for name in ("streamed", "disk")]
     assert streams[0] == streams[1]
     models = [_artifact(tmp_path / name).world_model.state_dict() for name in ("streamed", "disk")]
     for name in ("state_mean", "state_std"):
@@ -141,7 +141,7 @@ def test_a_lost_network_ends_the_run_and_a_resumed_one_goes_on_with_the_next_bat
 
     assert main(streamed(tmp_path / "straight", steps=20)) == 0
     one, two = (load_training_state(tmp_path / name) for name in ("lost", "straight"))
-    assert one["streams"] == two["streams"]
+    assert one["stream"] == two["stream"]
     for name, weight in one["learner"]["model"].items():
         assert torch.equal(weight, two["learner"]["model"][name])
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,14 +33,15 @@ from egovcp.values import build, convert
 CONFIG_FILE: Final = "train_config.yaml"
 STATE_FILE: Final = "state.pt"
 DIGEST_FILE: Final = f"{STATE_FILE}.sha256"
-"""In the format of ``sha256sum``; checkpoints of earlier versions have none."""
+"""In the format of ``sha256sum``."""
 _LIMIT_BYTES: Final = 5 * MAX_WEIGHT_BYTES + (1 << 30)  # weights, averages and moments; positions
 _REMEDY: Final = "restore this file, or remove it and give all options of the run as flags"
 
 
 # --- options -------------------------------------------------------------------------
 def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
-    """The stored options of the run that is resumed; empty without ``--resume``.
+    """The stored options of the run that is resumed; empty without ``--resume``, or if there are
+    none.
 
     Args:
         config_class: dataclass of the command's options.
@@ -49,7 +49,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
 
     Raises:
         UsageError: ``--resume`` is not a boolean, or a config file is given as well.
-        ArtifactError: the stored options cannot be read.
+        ArtifactError: the stored options cannot be read, or are not those of ``config_class``.
     """
     given = given_options(argv)
     if not convert(bool, given.get("resume", "false"), "--resume"):
@@ -59,16 +59,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
             f"--resume uses the options stored in --output_dir, and "
             f"--config_path={given['config_path']} gives others; drop it, and give changes as flags"
         )
-    return saved_options(config_class, Path(given.get("output_dir", "")))
-
-
-def saved_options(config_class: type, output: Path) -> dict[str, Any]:
-    """The options that a run has stored in its folder; empty if it has stored none.
-
-    Raises:
-        ArtifactError: they cannot be read, or are not those of ``config_class``.
-    """
-    saved = output / CONFIG_FILE
+    saved = Path(given.get("output_dir", "")) / CONFIG_FILE
     if not os.path.lexists(saved):
         return {}
     try:
@@ -118,13 +109,8 @@ def checkpoint_dir(output_dir: Path, step: int) -> Path:
 def new_checkpoint(output_dir: Path, step: int, state: dict[str, Any]) -> Iterator[Path]:
     """Write a checkpoint: the block fills ``pretrained_model``, an empty folder.
 
-    Then the training state is added and the checkpoint gets its name. If anything fails, nothing
-    is left, and ``last`` is the previous checkpoint.
-
-    Args:
-        output_dir: folder of the run.
-        step: names the checkpoint.
-        state: what `load_training_state` will return.
+    Then the training ``state`` is added and the checkpoint gets its name, ``step``. If anything
+    fails, nothing is left, and ``last`` is the previous checkpoint.
     """
     with removed_on_error(checkpoint_dir(output_dir, step).with_suffix(".partial")) as partial:
         for leftover in partial.parent.glob("*.partial"):  # of a killed run
@@ -160,7 +146,8 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         ArtifactError: there is none, or it cannot be read.
     """
     with _open_training_state(output_dir) as file:
-        return _load(file)
+        state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
+        return state
 
 
 @contextmanager
@@ -174,7 +161,9 @@ def _open_training_state(output_dir: Path) -> Iterator[IO[bytes]]:
             f"{path.relative_to(output_dir)}); start without --resume in a new folder"
         )
     try:
-        _require_digest(path)
+        expected = read_text(path.with_name(DIGEST_FILE), 1024).split(" ")[0]
+        if sha256(path, _LIMIT_BYTES) != expected:
+            raise UnsafeFileError(f"its SHA-256 is not the one in {DIGEST_FILE}; it is damaged")
         with open_regular(path, _LIMIT_BYTES) as file:
             yield file
     except (OSError, UnsafeFileError) as error:
@@ -202,29 +191,6 @@ def restoring(output_dir: Path) -> Iterator[None]:
             f"{output_dir}: its checkpoint does not fit the options given ({reason}); resume "
             "without them, or start a new run"
         ) from error
-
-
-def _require_digest(path: Path) -> None:
-    """Raise `UnsafeFileError` unless the SHA-256 of the state is the stored one."""
-    digest = path.with_name(DIGEST_FILE)
-    if not os.path.lexists(digest):
-        return
-    expected = read_text(digest, 1024).split(" ")[0]
-    if sha256(path, _LIMIT_BYTES) != expected:
-        raise UnsafeFileError(f"its SHA-256 is not the one in {DIGEST_FILE}; it is damaged")
-
-
-def _load(file: IO[bytes]) -> dict[str, Any]:
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            state = torch.load(file, map_location="cpu", weights_only=True)
-    except MemoryError:
-        raise
-    except Exception as error:  # the unpickler raises any exception on damaged bytes
-        raise UnsafeFileError("not a training state") from error
-    if not isinstance(state, dict):
-        raise UnsafeFileError("not a training state")
-    return state
 
 
 def pretrained_weights(model: WorldModel, path: str) -> dict[str, torch.Tensor]:

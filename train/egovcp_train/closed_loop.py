@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
 from egovcp.model import WorldModel
-from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.plan import PlannerConfig
 from egovcp.plan.policy import Policy
 from egovcp.sim.scenario import VALIDATION, Scenario
@@ -25,26 +24,11 @@ ROBOTS: Final = 8  # side by side
 type Played = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
 
-def require_simulator() -> None:
-    """Raise `MissingPackage` where the simulator is not installed."""
-    require_packages("egovcp-train", "--eval_closed_loop", *SIMULATOR_MODULES)
-
-
 class ClosedLoop:
     """Plays the same scenarios of each task with any model."""
 
     def __init__(self, tasks: Sequence[str], episodes: int, seed: int, controller_id: str) -> None:
-        """Choose the controller that the data was collected with.
-
-        Args:
-            tasks: the tasks to play.
-            episodes: scenarios of each.
-            seed: which ones.
-            controller_id: of the data.
-
-        Raises:
-            UsageError: the controller is not one of those that egovcp ships.
-        """
+        """Raises `UsageError` unless ``controller_id`` is that of a controller of egovcp."""
         self._controller = _named(controller_id, tasks)
         self._tasks, self._episodes, self._seed = tuple(tasks), episodes, seed
 

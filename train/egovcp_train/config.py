@@ -198,7 +198,7 @@ class TrainConfig:
     """CPU threads; 0: PyTorch's default, usually one per physical core."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
-    mixed_precision: str = "auto"
+    mixed_precision: Literal["no", "bf16", "auto"] = "auto"
     """Precision of matrix products: no, bf16, or auto (bf16 if the hardware supports it)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""

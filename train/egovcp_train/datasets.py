@@ -108,8 +108,7 @@ def prepare(
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    mix, sampling = mix_of(config), sampler_config(config)
-    return TrainingData(readers, config, *build(readers, config, sampling, mix, model))
+    return TrainingData(readers, config, *build(readers, config, model))
 
 
 def convert_if_needed(config: TrainConfig) -> TrainConfig:
@@ -192,7 +191,6 @@ def require_same_content(readers: Sequence[DatasetReader], digests: Sequence[str
     """Raise `DataError` unless a resumed run continues with the same data, in any location.
 
     Args:
-        readers: the datasets.
         digests: `DatasetReader.content_digest` of those that the run was started with.
     """
     found = [reader.content_digest for reader in readers]
@@ -237,29 +235,17 @@ def _resolved(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainCon
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
 
-def _in_memory(
-    readers: Sequence[DatasetReader],
-    config: TrainConfig,
-    sampling: SamplerConfig,
-    mix: Mix,
-    model: WorldModel,
-) -> Built:
+def _in_memory(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Built:
     training, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     _require_returns(readers, training)
     set_normalisation(model, training, config.returns)
-    stream = PrefetchIterator(InMemorySampler(training, sampling, mix))
-    return stream, heldout, lambda: training
+    sampler = InMemorySampler(training, sampler_config(config), mix_of(config))
+    return PrefetchIterator(sampler), heldout, lambda: training
 
 
-def _on_disk(
-    readers: Sequence[DatasetReader],
-    config: TrainConfig,
-    sampling: SamplerConfig,
-    mix: Mix,
-    model: WorldModel,
-) -> Built:
+def _on_disk(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Built:
     training, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = training
     if training.is_remote:
@@ -274,8 +260,8 @@ def _on_disk(
     set_normalisation(model, store, config.returns, state)
     stream = StreamingSampler(
         training,
-        sampling,
-        mix,
+        sampler_config(config),
+        mix_of(config),
         config.loading.shuffle,
         config.returns,
         checked=not training.is_remote,
@@ -313,7 +299,6 @@ def set_normalisation(
     """Set the model's statistics from the training episodes.
 
     Args:
-        model: whose statistics are set.
         store: the episodes, or a sample of them.
         config: definition of their returns.
         state: mean and standard deviation (S,) of the state; None: those of ``store``.

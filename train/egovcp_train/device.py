@@ -39,18 +39,9 @@ def choose_bf16(name: str, device: torch.device) -> bool:
     """Whether matrix products are in bfloat16, for a value of ``--mixed_precision``.
 
     auto: if the device computes in it; emulated bfloat16 is slower than float32.
-
-    Raises:
-        UsageError: the value is another one than no, bf16 and auto.
     """
-    if name == "auto":
-        return _computes_in_bf16(device)
-    if name not in ("no", "bf16"):
-        raise UsageError(f"--mixed_precision={name}; expected no, bf16 or auto")
-    return name == "bf16"
-
-
-def _computes_in_bf16(device: torch.device) -> bool:
+    if name != "auto":
+        return name == "bf16"
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     has = torch.cpu.get_capabilities() if device.type == "cpu" else {}

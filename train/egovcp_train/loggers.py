@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -105,12 +105,7 @@ class WandbLogger(_RunLogger):
     """Logs to one run of Weights & Biases; a resumed training continues it."""
 
     def __init__(self, output: Path, config: WandbConfig, options: Mapping[str, Any]) -> None:
-        """Start or continue the run.
-
-        Args:
-            output: folder of the training, which stores the id of the run.
-            config: project and user.
-            options: those of the training, to be logged.
+        """Start or continue the run, whose id is stored in ``output``.
 
         Raises:
             EnvironmentFailure: the user is not logged in, or the server cannot be reached.
@@ -146,29 +141,3 @@ class WandbLogger(_RunLogger):
             artifact = self._package.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
             artifact.add_dir(str(folder))
             self._run.log_artifact(artifact)
-
-
-class Loggers(Logger):
-    """All loggers of a run; false if there are none."""
-
-    def __init__(self, loggers: Sequence[Logger]) -> None:
-        self._loggers = tuple(loggers)
-
-    def __bool__(self) -> bool:
-        return bool(self._loggers)
-
-    def log_scalars(self, step: int, values: Mapping[str, float]) -> None:
-        for logger in self._loggers:
-            logger.log_scalars(step, values)
-
-    def log_image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
-        for logger in self._loggers:
-            logger.log_image(step, name, pixels)
-
-    def log_policy(self, step: int, folder: Path) -> None:
-        for logger in self._loggers:
-            logger.log_policy(step, folder)
-
-    def close(self) -> None:
-        for logger in self._loggers:
-            logger.close()

@@ -52,8 +52,6 @@ class Learner:
         """
         Args:
             model: the networks, which are trained in place.
-            config: optimiser and learning rate.
-            seed: seed of the random stream.
             bf16: compute matrix products in bfloat16.
             planner: costs of the actions that the critic plans.
         """

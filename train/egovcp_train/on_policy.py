@@ -20,7 +20,7 @@ from egovcp.cli import save_config
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import CONFIG_FILE, checkpoint_dir, new_checkpoint, restoring
-from egovcp_train.loggers import Loggers, TensorBoardLogger
+from egovcp_train.loggers import TensorBoardLogger
 from egovcp_train.loop import Budget
 
 type Log = dict[str, list[float]]
@@ -61,11 +61,9 @@ def rsl_rl_config(
     """rsl-rl's configuration.
 
     Args:
-        ppo: options of the algorithm.
         actor: options of its model.
         critic: likewise.
         obs_groups: model -> groups of observations that it reads.
-        initial_std: standard deviation of the actions at the start.
         symmetry: rsl-rl's ``symmetry_cfg``.
     """
     noise = {"class_name": "GaussianDistribution", "init_std": initial_std, "std_type": "log"}
@@ -169,9 +167,7 @@ def run_iterations(
     """Train until the budget or a signal ends the run; the last state is always saved.
 
     Args:
-        learner: what is trained.
         config: options of the command, which are stored.
-        output: folder of the run.
         state: training state from which the run is resumed; empty without ``config.resume``.
         write_policy: writes the policy to a folder.
         summary: scalars of an iteration -> text beside the progress bar.
@@ -187,7 +183,7 @@ def run_iterations(
     output.mkdir(parents=True, exist_ok=True)
     save_config(replace(config, resume=False), str(output / CONFIG_FILE))
     budget = Budget(config.steps, config.max_minutes, spent=float(state.get("seconds", 0.0)))
-    loggers = Loggers([TensorBoardLogger(output)] if config.tensorboard else [])
+    logger = TensorBoardLogger(output) if config.tensorboard else None
 
     def save() -> None:
         state = learner.state_dict() | {"seconds": budget.spent}
@@ -208,14 +204,16 @@ def run_iterations(
     ):
         while budget.progress(learner.steps) < 1.0 and not stopped:
             scalars = learner.iterate()
-            loggers.log_scalars(learner.steps, scalars)
+            if logger:
+                logger.log_scalars(learner.steps, scalars)
             bar.set_postfix(summary(scalars), refresh=False)
             bar.update(learner.steps - bar.n)
             if learner.iteration % config.save_freq == 0:
                 save()
     if learner.iteration > start and learner.iteration % config.save_freq:
         save()
-    loggers.close()
+    if logger:
+        logger.close()
     finished = budget.progress(learner.steps) >= 1.0
     folder = checkpoint_dir(output, learner.iteration) / "pretrained_model"
     echo(final_message(folder, "done" if finished else "stopped early"))

@@ -174,7 +174,6 @@ def write_card(folder: Path, run: Path, repo_id: str) -> None:
     """Write card and training curves to the folder of an artifact.
 
     Args:
-        folder: the artifact.
         run: output folder of the run, whose records the curves show.
         repo_id: id on the Hub for the examples; empty: they name the folder.
     """
@@ -186,7 +185,6 @@ def card_text(artifact: Artifact, repo_id: str) -> str:
     """The card of a policy, from its manifest.
 
     Args:
-        artifact: the policy.
         repo_id: id on the Hub, `user/name`, for the examples; empty: they name the folder, or the
             shipped policy.
     """

@@ -18,13 +18,13 @@ from tqdm import tqdm
 from egovcp.artifact import save_artifact
 from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.errors import ArtifactError, UsageError
+from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
-from egovcp.packages import require_packages
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.plan.backends import make_evaluator
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
@@ -39,7 +39,7 @@ from egovcp_train.checkpoint import (
     restoring,
     resumed_options,
 )
-from egovcp_train.closed_loop import ClosedLoop, require_simulator
+from egovcp_train.closed_loop import ClosedLoop
 from egovcp_train.config import PRESETS, TrainConfig
 from egovcp_train.datasets import (
     EVALUATION_EPISODES,
@@ -56,7 +56,7 @@ from egovcp_train.datasets import (
 from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
 from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
-from egovcp_train.loggers import Logger, Loggers, TensorBoardLogger, TrackioLogger, WandbLogger
+from egovcp_train.loggers import Logger, TensorBoardLogger, TrackioLogger, WandbLogger
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.publish import publish_trained, reserve_policy, versions, write_card
 
@@ -208,9 +208,10 @@ class TrainingRun:
         artifact = final / "pretrained_model"
         echo(self._final_message(artifact, stopped=not finished))
         write_card(artifact, self.output, self.config.policy.repo_id)
-        if finished:
-            self.loggers.log_policy(self.learner.step, artifact)
-        self.loggers.close()
+        for logger in self.loggers:
+            if finished:
+                logger.log_policy(self.learner.step, artifact)
+            logger.close()
         if finished and self.config.policy.push_to_hub:
             publish_trained(artifact, self.config.policy)
 
@@ -233,7 +234,7 @@ class TrainingRun:
                 terms = learner.update(batch, progress)
                 bar.update()
                 if learner.step % config.log_freq == 0:
-                    self.loggers.log_scalars(learner.step, {k: float(v) for k, v in terms.items()})
+                    self._log({k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
                     if learner.unrecorded and not warned:
                         warned = True
@@ -268,14 +269,17 @@ class TrainingRun:
 
     def show(self, report: HeldoutReport) -> None:
         """Record the last measurements and their pictures."""
-        step, heldout = self.learner.step, self.metrics | scalars(self.tasks)
+        heldout = self.metrics | scalars(self.tasks)
         found = {f"heldout/{k}": v for k, v in heldout.items()}
-        self.loggers.log_scalars(
-            step, found | {f"closed_loop/{k}": v for k, v in self.played.items()}
-        )
-        if self.loggers:
-            for name, picture in draw(report).items():
-                self.loggers.log_image(step, f"heldout/{name}", picture)
+        self._log(found | {f"closed_loop/{k}": v for k, v in self.played.items()})
+        pictures = draw(report) if self.loggers else {}
+        for logger in self.loggers:
+            for name, picture in pictures.items():
+                logger.log_image(self.learner.step, f"heldout/{name}", picture)
+
+    def _log(self, values: dict[str, float]) -> None:
+        for logger in self.loggers:
+            logger.log_scalars(self.learner.step, values)
 
     def save(self) -> None:
         """Write a checkpoint: the averaged model as artifact, and the training state.
@@ -288,7 +292,7 @@ class TrainingRun:
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         state = {
             "learner": self.learner.state_dict(),
-            "streams": [self.data.stream.state_dict()],
+            "stream": self.data.stream.state_dict(),
             "datasets": [reader.content_digest for reader in self.data.readers],
             "seconds": self.budget.spent,
         }
@@ -332,14 +336,14 @@ def _prepare_output(config: TrainConfig) -> Path:
     except ValueError as error:
         raise UsageError(f"--policy: {error}; make the networks smaller") from error
     if config.eval_closed_loop:
-        require_simulator()
+        require_packages("egovcp-train", "--eval_closed_loop", *SIMULATOR_MODULES)
     output = prepare_output(config.output_dir, config.resume)
     if config.resume:
         require_datasets(config)
     return output
 
 
-def _loggers(config: TrainConfig, output: Path) -> Loggers:
+def _loggers(config: TrainConfig, output: Path) -> list[Logger]:
     found: list[Logger] = []
     if config.tensorboard:
         found.append(TensorBoardLogger(output))
@@ -347,15 +351,14 @@ def _loggers(config: TrainConfig, output: Path) -> Loggers:
         found.append(WandbLogger(output, config.wandb, draccus.encode(config)))
     if config.trackio:
         found.append(TrackioLogger(output, config.trackio, draccus.encode(config)))
-    return Loggers(found)
+    return found
 
 
 def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
     """Restore the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
-        ArtifactError: the networks have changed, or an earlier version trained in several
-            processes.
+        ArtifactError: the networks have changed.
         DataError: the dataset has changed.
         UsageError: the windows have changed.
     """
@@ -363,13 +366,7 @@ def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
     with restoring(output):
         require_same_content(data.readers, state["datasets"])
         learner.load_state_dict(state["learner"])
-        streams = state["streams"]  # a list, because earlier versions had one for each process
-        if len(streams) > 1:
-            raise ArtifactError(
-                f"{output} was trained in {len(streams)} processes by an earlier version; expected "
-                "one: start a new run, with --policy.pretrained_path to begin from its policy"
-            )
-        data.stream.load_state_dict(streams[0])
+        data.stream.load_state_dict(state["stream"])
         return float(state["seconds"])
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.index import HELDOUT_FRACTION, in_split
+from egovcp.data.index import in_split
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import Source, locate
 from egovcp.outputs import output_file, write_report
@@ -47,7 +47,7 @@ def describe(reader: DatasetReader) -> dict[str, Any]:
     return {
         **_contents(reader, reader.source, [(reader.task(i), length) for i, length in lengths]),
         "episodes": len(reader),
-        "heldout_episodes": sum(in_split(identities, "heldout", HELDOUT_FRACTION)),
+        "heldout_episodes": sum(in_split(identities, "heldout")),
         "controller_id": reader.controller_id,
         "seed": provenance.get("seed"),
         "command": provenance.get("command", ""),

@@ -8,20 +8,31 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Literal
 
+import numpy as np
+import pyarrow as pa
 from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.checks.lerobot_dataset import LeRobotCheck
-from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, metadata, schema
 from egovcp.data.destination import require_new, resolve_root
-from egovcp.data.lerobot import LeRobotReader, is_own
+from egovcp.data.lerobot import LeRobotReader, episode_runs, is_own
+from egovcp.data.parquet import (
+    EPISODE_FEATURES,
+    data_errors,
+    open_data_file,
+    present_columns,
+    read_columns,
+)
+from egovcp.data.paths import files_below
 from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
 from egovcp.outputs import output_file, write_report
+from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo, echo_lines, one_line
 from egovcp_collect.dataset.check import problem_as_json
 from egovcp_collect.dataset.record_index import (
@@ -30,8 +41,9 @@ from egovcp_collect.dataset.record_index import (
     join_provenance,
     require_one_controller,
 )
-from egovcp_collect.dataset.recovery import RecoveredEpisode, recover_episodes
 from egovcp_collect.dataset.subset import SubsetWriter, scan_episodes
+
+_TIMESTAMP_TOLERANCE_S: Final = 1e-3  # timestamps are float32
 
 
 @dataclass(frozen=True)
@@ -209,52 +221,91 @@ def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) ->
     """Each sound episode once; the errors of the others are appended to ``dropped``."""
     seen: set[int | None] = set()
     finder, scenarios = DuplicateFinder[int](), ScenarioKeys(index.provenance)
-    for found in recover_episodes(root):
+    for found in _read_data_files(root):
         if isinstance(found, DataError):
-            result: Episode | DataError = found
+            dropped.append(found)
             seen.add(found.episode)
+            continue
+        path, number, episode = found
+        seen.add(number)
+        try:
+            sound = _validated(episode, number, index, scenarios, finder)
+        except DataError as error:
+            dropped.append(DataError.at(path, error.problem, number, error.frame))
         else:
-            result = _validate(found, index, scenarios, finder)
-            seen.add(found.number)
-        if isinstance(result, DataError):
-            dropped.append(result)
-        else:
-            yield result
+            yield sound
     for number in sorted(set(range(index.recorded)) - seen):
         dropped.append(DataError.at(_data_path(root, number), "cannot be read", number))
 
 
-def _validate(
-    found: RecoveredEpisode,
+def _read_data_files(root: Path) -> Iterator[tuple[Path, int, Episode] | DataError]:
+    """File, ``episode_index`` and content of each episode in the data files, independent of most of
+    `meta`, and an error for each unreadable part."""
+    try:
+        robot = metadata.load_robot(metadata.load_v3_info(root), root / schema.INFO_PATH)
+    except DataError:
+        robot = G1
+    for path in files_below(root / "data"):
+        if path.suffix == ".parquet":
+            try:
+                file = open_data_file(root, path, robot)
+            except DataError as error:
+                yield error
+                continue
+            names = present_columns(schema.FEATURES, file.schema_arrow.names)
+            for found in episode_runs(file, path, names):
+                if isinstance(found, DataError):
+                    yield found
+                    continue
+                number, table = found
+                try:
+                    yield path, number, _assembled(path, table, robot)
+                except DataError as error:
+                    yield DataError.at(path, error.problem or str(error), number, error.frame)
+
+
+def _assembled(path: Path, table: pa.Table, robot: RobotSpec) -> Episode:
+    """The rows as an episode without task, time limit and metadata, on which its digest does not
+    depend."""
+    with data_errors(path):
+        columns = read_columns(table, schema.FEATURES, robot)
+    frames = np.arange(len(table))
+    late = np.abs(columns["timestamp"] - frames / robot.planner_hz)
+    wrong = (columns["frame_index"] != frames) | ~(late <= _TIMESTAMP_TOLERANCE_S)
+    if wrong.any():
+        problem = f"its frame indices or timestamps do not count at {robot.planner_hz} Hz from 0"
+        raise DataError.without_place(problem, int(np.argmax(wrong)))
+    arrays: dict[str, Any] = {name: columns[key] for name, key in EPISODE_FEATURES.items()}
+    return Episode(**arrays, task="", time_limit=0, robot=robot)
+
+
+def _validated(
+    found: Episode,
+    number: int,
     index: RecordIndex,
     scenarios: ScenarioKeys,
     finder: DuplicateFinder[int],
-) -> Episode | DataError:
-    """The episode with its record, or its first problem."""
-    digest = found.episode.digest()
-    record = index.find(digest, found.number)
+) -> Episode:
+    """The episode with its record; raises `DataError` with its first problem."""
+    digest = found.digest()
+    record = index.find(digest, number)
     if record is None:
-        problem = (
+        raise DataError.without_place(
             "its content is in no record (meta/collection.json, --records): it was altered, or "
             "comes from another dataset"
         )
-        return DataError.at(found.file, problem, found.number)
     episode = replace(
-        found.episode,
+        found,
         task=record["task"],
         time_limit=record["time_limit"],
         metadata=record.get("metadata", {}),
     )
-    first = next(itertools.chain(episode.problems(), command_problems(episode)), None)
-    if first is not None:
-        return DataError.at(found.file, first[1], found.number, first[0])
-    try:
-        scenario = scenarios.key(episode.task, episode.metadata)
-    except DataError as error:
-        return DataError.at(found.file, error.problem, found.number)
-    duplicate = finder.add(found.number, digest, scenario)
+    for frame, problem in itertools.chain(episode.problems(), command_problems(episode)):
+        raise DataError.without_place(problem, frame)
+    scenario = scenarios.key(episode.task, episode.metadata)
+    duplicate = finder.add(number, digest, scenario)
     if duplicate is not None:
-        return DataError.at(found.file, duplicate.problem(scenario), found.number)
+        raise DataError.without_place(duplicate.problem(scenario))
     return episode
 
 

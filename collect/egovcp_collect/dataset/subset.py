@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from egovcp.checks.feature_statistics import Statistics, describe
 from egovcp.checks.lerobot_dataset import LeRobotCheck
+from egovcp.checks.lerobot_episode import Statistics, describe
 from egovcp.data import dataset_files, schema
 from egovcp.data.features import Feature
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, VideoSpan

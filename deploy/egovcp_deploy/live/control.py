@@ -14,18 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController
+from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN, NUM_JOINTS
+from egovcp_deploy.live.hardware import AnyCamera
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
-from egovcp_deploy.robots.base import (
-    Array,
-    DepthCamera,
-    LowState,
-    MotorCommand,
-    proprioception,
-)
+from egovcp_deploy.robots.base import Array, LowState, MotorCommand, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
 
 #: N m s/rad in DAMP: legs and waist let a standing robot sink in about a second.
@@ -105,30 +101,20 @@ class VelocityCommand:
 
 
 class ControlLoop:
-    """The loop of one robot; call `tick` at 50 Hz.
-
-    Args:
-        refusal: why the robot must not be armed, called at every tick; empty: no reason.
-        fault: why the motors must be damped, likewise.
-        skipped: fault of the readings rejected since the last valid one, likewise.
-        link: `Tick.link` for the log, called at every planner tick.
-    """
+    """The loop of one robot; call `tick` at 50 Hz. ``link`` returns `Tick.link` for the log and is
+    called at every planner tick."""
 
     def __init__(
         self,
         body: BridgeRobot,
-        camera: DepthCamera,
+        camera: AnyCamera,
         controller: LowLevelController,
         pilot: Pilot,
-        refusal: Callable[[], str] = lambda: "",
-        fault: Callable[[], str] = lambda: "",
-        skipped: Callable[[], str] = lambda: "",
         link: Callable[[int], Mapping[str, float]] = lambda now_ns: {},
     ) -> None:
         self._body, self._camera = body, camera
         self._controller = controller
         self.pilot = pilot
-        self._refusal, self._fault, self._skipped = refusal, fault, skipped
         self._link = link
         self._velocity = VelocityCommand()
         self._motor_watch = MotorWatch()
@@ -197,10 +183,10 @@ class ControlLoop:
         self.pilot.add_events(verdict.events)
         facts = Facts(
             now_ns,
-            refusal=self._refusal() or verdict.arming_refusal,
+            refusal=self._body.refusal or verdict.arming_refusal,
             hold=verdict.hold,
-            damp=self._fault() or verdict.damp,
-            skipped=self._skipped(),
+            damp=self._body.fault or verdict.damp,
+            skipped=self._body.rejected,
         )
         self.pilot.update_state(facts, request)
 
@@ -219,8 +205,8 @@ class ControlLoop:
         if not np.isfinite(target).all():
             self.pilot.update_state(Facts(now_ns, controller_ok=False))
             return damping_command(position, mode)
-        gains, share = (self._controller.stiffness, self._controller.damping), 1.0
+        share = 1.0
         if self.state is State.STAND:
             supervisor = self.pilot.supervisor
             share = supervisor.time_in_state_s(now_ns) / supervisor.limits.stand_s
-        return ramp_command(self._ramp_start, target, *gains, share, mode)
+        return ramp_command(self._ramp_start, target, STIFFNESS, DAMPING, share, mode)

@@ -24,7 +24,7 @@ from egovcp.spec import CONTROLLER_HZ
 from egovcp.terminal import echo, one_line
 from egovcp.workers import stop_on_signal
 from egovcp_deploy.live.control import ControlLoop, damping_command
-from egovcp_deploy.live.hardware import ControlSetup, Hardware, open_hardware
+from egovcp_deploy.live.hardware import Hardware, RobotOptions, open_hardware
 from egovcp_deploy.live.link import Link, RemotePlanner
 from egovcp_deploy.live.operators import RemoteOperator
 from egovcp_deploy.pilot.pilot import Pilot
@@ -46,9 +46,10 @@ _DAMPING_PERIOD_NS: Final = 5_000_000
 _SWITCH_S: Final = 0.001  # longest wait of the loop for a receiving thread
 
 
-def control_process(setup: ControlSetup) -> None:
+def control_process(options: RobotOptions, address: str, parent: int) -> None:
     """Main function of the process; returns on a quit command, on SIGTERM, SIGHUP or SIGQUIT, or
-    2 s after the planner's process has ended, once the motors are damped."""
+    2 s after the planner's process ``parent`` has ended, once the motors are damped. ``address`` is
+    that of the link between them."""
     os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
     with stop_on_signal(signals=_STOP_SIGNALS, interrupt=False) as stopping:
@@ -56,14 +57,14 @@ def control_process(setup: ControlSetup) -> None:
         # Before there are threads: one that holds the interpreter's lock must not be preempted.
         raise_priority(RECEIVER_PRIORITY)
         try:
-            hardware = open_hardware(setup.bridge, setup.camera)
+            hardware = open_hardware(options.bridge, options.camera)
         except EgovcpError as error:
             # The line above may be an unfinished progress bar.
             echo("\n" + one_line(f"egovcp-deploy: error: {error}"), error=True)
             sys.exit(error.exit_code)
-        with closing(hardware), closing(Link(setup.address, serve=False)) as link:
+        with closing(hardware), closing(Link(address, serve=False)) as link:
             try:
-                control = ControlProcess(setup, hardware, link)
+                control = ControlProcess(options, parent, hardware, link)
                 if not raise_priority(CONTROL_PRIORITY):
                     control.add_event(f"warning: {NO_PRIORITY}")
                 gc.freeze()  # imported objects are not searched for garbage again
@@ -75,19 +76,16 @@ def control_process(setup: ControlSetup) -> None:
 class ControlProcess:
     """The control loop with its inputs: operator commands, remote control, parent process."""
 
-    def __init__(self, setup: ControlSetup, hardware: Hardware, link: Link) -> None:
-        self._parent = setup.parent
-        self._body = body = hardware.body
+    def __init__(self, options: RobotOptions, parent: int, hardware: Hardware, link: Link) -> None:
+        self._parent = parent
+        self._body = hardware.body
         self._planner = RemotePlanner(link)
         self._loop = ControlLoop(
-            body,
+            hardware.body,
             hardware.camera,
-            make_controller(setup.controller),
-            Pilot(self._planner, setup.limits),
-            refusal=lambda: body.refusal,
-            fault=lambda: body.fault,
-            skipped=lambda: body.rejected,
-            link=hardware.link,
+            make_controller(options.controller),
+            Pilot(self._planner, options.limits),
+            hardware.link,
         )
         self._remote = RemoteOperator()
         self._orphaned = 0

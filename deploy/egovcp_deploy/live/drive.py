@@ -19,7 +19,6 @@ from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import ControlSetup
 from egovcp_deploy.live.operators import open_operator
 from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
 from egovcp_deploy.live.processes import running_control, stop_control
@@ -39,7 +38,6 @@ from egovcp_deploy.recording import (
 def drive(config: DeployConfig, artifact: Artifact) -> None:
     """One run of a robot, recorded as rollout 0; raises as `deploy`."""
     robot = config.robot
-    setup = ControlSetup(robot.bridge, robot.camera, robot.controller, robot.limits)
     controller_id = make_controller(robot.controller).id
     artifact.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
@@ -58,7 +56,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
             open_viewer(config.log) as viewer,
             recording(folder, info, config.log, viewer, blocking=False) as sink,
             tqdm(unit="tick", desc="live") as bar,
-            running_control(setup) as control,
+            running_control(robot) as control,
         ):
             process, watchdog, clock = control.process, control.watchdog, MonotonicClock()
             loop = PlannerLoop(runner, control.link, operator, sink, clock, process.is_alive, stays)
@@ -70,12 +68,11 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
                 summary.damped = f"the control process died (exit code {process.exitcode})"
             elif not summary.ticks and summary.failure is None:
                 control.check_alive()
-        summary.missing_ticks = missing_ticks(sink)
     except EgovcpError:
         for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
             path.unlink()
         raise
-    report = {
+    report: dict[str, Any] = {
         "robot": robot.type,
         "ticks": summary.ticks,
         "ticks_running": summary.running,
@@ -86,19 +83,18 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
         **percentiles("plan_ms", summary.plan_ms),
         **percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
-        "missing_ticks": summary.missing_ticks,
+        "missing_ticks": missing_ticks(sink),
         "damped": summary.damped,
         "failure": "" if summary.failure is None else describe_failure(summary.failure),
         "events": summary.events,
         **provenance(info),
     }
     write_json(folder / "deploy.json", report)
-    latency = percentiles("ms", summary.latency_ms)
     skipped = f"; {summary.skipped} observations skipped" if summary.skipped else ""
     echo(
         f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
-        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
-        f"computed by {info.backend}{skipped}"
+        f"plan {report['latency_ms_p50']:.0f} ms, p99 {report['latency_ms_p99']:.0f}, "
+        f"{summary.late} late; plans computed by {info.backend}{skipped}"
     )
     print_viewer_command(folder / "rollout-0.rrd")
     _raise_failure(summary, folder)

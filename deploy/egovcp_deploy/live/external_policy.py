@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.live.hardware import ControlSetup
+from egovcp_deploy.live.hardware import RobotOptions
 from egovcp_deploy.live.link import decode_observation, encode_operator_command, encode_plan
 from egovcp_deploy.live.operators import EASE_S, Operator
 from egovcp_deploy.live.processes import running_control
@@ -35,8 +35,8 @@ class ExternalPolicyRobot:
     """One robot, from `connect` to `close`. ``operator`` requests standing up, arming and running;
     None: only the remote control does."""
 
-    def __init__(self, setup: ControlSetup, operator: Operator | None = None) -> None:
-        self._setup, self._operator = setup, operator
+    def __init__(self, options: RobotOptions, operator: Operator | None = None) -> None:
+        self._options, self._operator = options, operator
         self._stack = ExitStack()
         self._newest: ObservationMessage | None = None
         self._returned = -1
@@ -53,7 +53,7 @@ class ExternalPolicyRobot:
         if robot or camera do not answer, or it was not brought to RUN, `SafetyStop` if it was
         damped."""
         try:
-            self._control = self._stack.enter_context(running_control(self._setup))
+            self._control = self._stack.enter_context(running_control(self._options))
             self._control.watchdog.expected = lambda: self._closing
             deadline = time.monotonic() + _START_S
             while self.mode != State.RUN:

@@ -27,15 +27,24 @@ class CameraOptions:
 
 
 @dataclass(frozen=True)
-class ControlSetup:
-    """Configuration of the control process; picklable."""
+class RobotOptions:
+    """The robot."""
 
-    bridge: BridgeConfig
-    camera: CameraOptions
-    controller: str  # low-level controller, see `make_controller`
-    limits: Limits
-    address: str = ""  # of the link to the planner's process; set when the process is started
-    parent: int = 0  # process id of the planner; set when the process is started
+    type: Literal["sim", "unitree_g1", "replay"] = "sim"
+    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
+    behind LeRobot's bridge, on the wall clock. replay: recorded observations; the policy plans
+    again, and nothing is driven."""
+    recordings: str = ""
+    """For replay: an MCAP file, or a folder of them."""
+    controller: str = "walk"
+    """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; it must be
+    that of the policy's data. The simulated robot uses --env.controller."""
+    bridge: BridgeConfig = field(default_factory=BridgeConfig)
+    """Address of the bridge of a unitree_g1."""
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    """The depth camera of a unitree_g1."""
+    limits: Limits = field(default_factory=Limits)
+    """When the robot is held, and when its motors are damped."""
 
 
 @dataclass(frozen=True)

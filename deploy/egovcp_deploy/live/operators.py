@@ -10,7 +10,7 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -28,13 +28,6 @@ _VELOCITY_PERIOD_S: Final = 0.1
 _REQUEST_PERIOD_S: Final = 0.5  # of a refused request; a shorter one only fills the log
 
 
-class Operator(Protocol):
-    """Source of operator commands, polled often."""
-
-    def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
-        """New commands; ``mode`` is the robot's `State`, empty: unknown."""
-
-
 class AutomaticOperator:
     """Stands up, arms, and runs with ``velocity`` (vx, vy in m/s, yaw rate in rad/s); after
     ``duration_s`` (0: never) it holds and ends the run. For simulation and scripts."""
@@ -49,7 +42,8 @@ class AutomaticOperator:
         self._hold_ns: int | None = None
 
     def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
-        """The next step, repeated until it is done."""
+        """The next step, repeated until it is done; ``mode`` is the robot's `State`, empty:
+        unknown."""
         if now_ns < self._next_ns:
             return []
         command = self._next(now_ns, mode)
@@ -158,6 +152,9 @@ class RemoteOperator:
         return commands + [
             OperatorCommand(_BUTTONS[name]) for name in sorted(new & _BUTTONS.keys())
         ]
+
+
+type Operator = AutomaticOperator | Keyboard
 
 
 @contextmanager

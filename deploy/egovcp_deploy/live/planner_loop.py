@@ -52,7 +52,6 @@ class LiveSummary:
     latency_ms: list[float] = field(default_factory=list)  # from an observation to its plan
     iterations: list[int] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
-    missing_ticks: dict[str, int] = field(default_factory=dict)  # see `recording.missing_ticks`
     failure: Exception | None = None  # what ended the planning, after which the robot was held
 
 
@@ -65,7 +64,6 @@ class PlannerLoop:
         control_alive: whether the control process runs.
         stays: whether a robot held after Ctrl-C stands until the second Ctrl-C, as a real one must
             that is not on its gantry yet.
-        warn: prints an urgent message to the operator.
     """
 
     def __init__(
@@ -77,11 +75,10 @@ class PlannerLoop:
         clock: Clock,
         control_alive: Callable[[], bool],
         stays: bool = False,
-        warn: Callable[[str], None] = warn_on_stderr,
     ) -> None:
         self._runner, self._link, self._operator = runner, link, operator
         self._sink, self._clock, self._control_alive = sink, clock, control_alive
-        self._stays, self._warn = stays, warn
+        self._stays = stays
         self.summary = LiveSummary()
         self.interrupts: list[int] = []  # SIGINT as often as received
         self.quitting = False  # whether the control process has been sent a quit command
@@ -217,7 +214,7 @@ class PlannerLoop:
             message = f"the planner failed: {describe_failure(error)}"
             self._events.append(message)
             with suppress(Exception):  # the terminal may be what failed
-                self._warn(
+                warn_on_stderr(
                     f"{message}; the robot is held until the operator ends the run: Ctrl-C twice "
                     "damps it"
                 )

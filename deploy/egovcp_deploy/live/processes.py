@@ -8,7 +8,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import replace
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -17,7 +16,7 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.log.async_sink import warn_on_stderr
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.live.control_process import control_process, damp_motors
-from egovcp_deploy.live.hardware import ControlSetup
+from egovcp_deploy.live.hardware import RobotOptions
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 
@@ -45,16 +44,15 @@ class RunningControl(NamedTuple):
 
 
 @contextmanager
-def running_control(setup: ControlSetup) -> Iterator[RunningControl]:
+def running_control(options: RobotOptions) -> Iterator[RunningControl]:
     """Start the control process, its link and its watchdog; raises `EnvironmentFailure` if the
     robot does not answer."""
     with tempfile.TemporaryDirectory(prefix="egovcp-run-") as folder:
         address = f"ipc://{folder}/link"
-        setup = replace(setup, address=address, parent=os.getpid())
         with (
             closing(Link(address, serve=True)) as link,
-            standby_body(setup.bridge) as body,
-            _started(setup) as process,
+            standby_body(options.bridge) as body,
+            _started(options, address) as process,
         ):
             watchdog = DampingWatchdog(process, body)
             try:
@@ -64,10 +62,10 @@ def running_control(setup: ControlSetup) -> Iterator[RunningControl]:
 
 
 @contextmanager
-def _started(setup: ControlSetup) -> Iterator[BaseProcess]:
+def _started(options: RobotOptions, address: str) -> Iterator[BaseProcess]:
     """The process; terminated, then killed, when the context is left."""
     process = multiprocessing.get_context("spawn").Process(
-        target=control_process, args=(setup,), name="egovcp-control"
+        target=control_process, args=(options, address, os.getpid()), name="egovcp-control"
     )
     with inherited_by_workers():
         process.start()
@@ -111,13 +109,9 @@ class DampingWatchdog:
     """A thread that damps the robot over ``body``, a connection that nothing else uses, if the
     control process ends although ``expected()`` is false."""
 
-    def __init__(
-        self,
-        process: BaseProcess,
-        body: BridgeRobot,
-        expected: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self._process, self._body, self.expected = process, body, expected
+    def __init__(self, process: BaseProcess, body: BridgeRobot) -> None:
+        self._process, self._body = process, body
+        self.expected: Callable[[], bool] = lambda: False
         self.acted = False  # whether the robot had to be damped from here
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()

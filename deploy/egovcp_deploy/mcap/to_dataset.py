@@ -72,11 +72,11 @@ def run(config: ToDatasetConfig) -> None:
     if config.mapping:
         _convert_topics(config, paths, root)
         return
-    common = provenance(paths)
-    require_different(paths, config.gaps)
-    with DatasetWriter(root, common) as writer:
+    seen: list[tuple[Path, list[bytes]]] = []
+    with DatasetWriter(root, provenance(paths)) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
+            require_different(path, episode, seen)
             writer.add(episode)
             echo(f"{path}: {len(episode)} ticks{cut}")
     echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
@@ -161,26 +161,23 @@ def provenance(paths: Sequence[Path]) -> Provenance:
     )
 
 
-def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
-    """Raise `DataError` if two recordings have the same rows, before anything is written. A copy
-    may end earlier: a truncated recording that was recovered begins with the same rows."""
-    seen: list[tuple[Path, list[bytes]]] = []
-    for path in paths:
-        episode, _ = read_episode(path, gaps)
-        columns = (episode.depth, episode.state, episode.action, episode.reward)
-        content = (b"".join(c[t].tobytes() for c in columns) for t in range(len(episode)))
-        rows = [hashlib.blake2b(row, digest_size=16).digest() for row in content]
-        for other, other_rows in seen:
-            shared = min(len(rows), len(other_rows))
-            if rows[:shared] == other_rows[:shared]:
-                raise DataError(
-                    f"{path} repeats {other}: its first {shared} rows are the same; give each "
-                    "rollout once, as its longest recording"
-                )
-        seen.append((path, rows))
+def require_different(path: Path, episode: Episode, seen: list[tuple[Path, list[bytes]]]) -> None:
+    """Add the digests of the rows to ``seen``; raise `DataError` if another recording there begins
+    with the same rows. A copy may end earlier, as a truncated recording that was recovered."""
+    columns = (episode.depth, episode.state, episode.action, episode.reward)
+    content = (b"".join(c[t].tobytes() for c in columns) for t in range(len(episode)))
+    rows = [hashlib.blake2b(row, digest_size=16).digest() for row in content]
+    for other, other_rows in seen:
+        shared = min(len(rows), len(other_rows))
+        if rows[:shared] == other_rows[:shared]:
+            raise DataError(
+                f"{path} repeats {other}: its first {shared} rows are the same; give each "
+                "rollout once, as its longest recording"
+            )
+    seen.append((path, rows))
 
 
-def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
+def read_episode(path: Path, gaps: str) -> tuple[Episode, str]:
     """Convert a recording to an episode; the text says what was left out. Raises `DataError` if it
     is not ours, damaged, or has missing ticks or invalid values."""
     from egovcp.rollouts import episode_of

@@ -1,15 +1,14 @@
 """Interfaces of robots.
 
-`SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `BridgeRobot` and
-`DepthCamera` are the motors, IMU and camera of a robot on the wall clock, whose low-level
-controller runs in our process.
+`SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `BridgeRobot`,
+`ZmqDepthCamera` and `RealSenseDepthCamera` are the motors, IMU and camera of a robot on the wall
+clock, whose low-level controller runs in our process; none of their reads blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,13 +84,6 @@ class DepthImage:
     captured_ns: int | None = None
     """Time at which the camera driver received it, on the same clock and without network delay;
     None if unknown."""
-
-
-class DepthCamera(Protocol):
-    """A depth camera. No call blocks."""
-
-    def read(self) -> DepthImage | None:
-        """Return the newest image; None before the first."""
 
 
 def proprioception(state: LowState, command: NDArray[np.floating]) -> Array:

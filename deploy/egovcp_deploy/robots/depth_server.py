@@ -16,7 +16,7 @@ from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure
 from egovcp.rate import NS_PER_S, FixedRate, MonotonicClock, RateLimiter
 from egovcp.terminal import echo
-from egovcp_deploy.robots.base import DepthCamera, DepthImage
+from egovcp_deploy.robots.base import DepthImage
 from egovcp_deploy.robots.realsense_camera import RealSenseConfig, RealSenseDepthCamera
 from egovcp_deploy.robots.subscriber import bind_socket
 from egovcp_deploy.robots.wire import CAMERA_PORT
@@ -45,10 +45,11 @@ class DepthServerConfig:
 
 
 class DepthServer:
-    """Publishes each image of a `DepthCamera` once; raises `EnvironmentFailure` if the port is in
-    use."""
+    """Publishes each image of a camera once; raises `EnvironmentFailure` if the port is in use."""
 
-    def __init__(self, camera: DepthCamera, vertical_fov: float, host: str, port: int) -> None:
+    def __init__(
+        self, camera: RealSenseDepthCamera, vertical_fov: float, host: str, port: int
+    ) -> None:
         self._camera, self._fov = camera, vertical_fov
         self._image_ns, self._warnings = time.monotonic_ns(), RateLimiter(1.0)
         self._last: DepthImage | None = None

@@ -49,20 +49,9 @@ class RealSenseConfig:
     """Field of view of the policy's images, rad; the camera's must not be much smaller."""
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without distortion, as the depth of a RealSense D400 is."""
-
-    width: int
-    height: int
-    fx: float  # focal lengths, pixels
-    fy: float
-    cx: float  # principal point, pixels; the centre of the first pixel is 0
-    cy: float
-
-
 class DepthResampler:
-    """Resamples images of one camera to (48, 64), with ``vertical_fov`` rad.
+    """Resamples images of one camera to (48, 64), with ``vertical_fov`` rad; ``camera`` is its
+    ``pyrealsense2.intrinsics`` without distortion, as the depth of a D400 has.
 
     Output pixel (i, j) looks along ((j - 31.5) / f, (i - 23.5) / f, 1), right, down and forward,
     with f = 24 / tan(fov / 2), as in the simulated camera. Depth is planar in both. Each pixel is
@@ -70,13 +59,13 @@ class DepthResampler:
     measured depth: surfaces are never blended. With fewer than five valid ones it is invalid.
     """
 
-    def __init__(self, camera: Intrinsics, vertical_fov: float) -> None:
+    def __init__(self, camera: Any, vertical_fov: float) -> None:
         focal = focal_length(vertical_fov)
         offsets = np.array([-_SAMPLE_SPACING, 0.0, _SAMPLE_SPACING])
         down = (np.arange(DEPTH_ROWS)[:, None] - (DEPTH_ROWS - 1) / 2 + offsets) / focal
         right = (np.arange(DEPTH_COLS)[:, None] - (DEPTH_COLS - 1) / 2 + offsets) / focal
-        rows = np.rint(camera.fy * down + camera.cy).astype(np.intp)  # (48, 3)
-        columns = np.rint(camera.fx * right + camera.cx).astype(np.intp)  # (64, 3)
+        rows = np.rint(camera.fy * down + camera.ppy).astype(np.intp)  # (48, 3)
+        columns = np.rint(camera.fx * right + camera.ppx).astype(np.intp)  # (64, 3)
         in_rows = (rows >= 0) & (rows < camera.height)
         in_columns = (columns >= 0) & (columns < camera.width)
         index = rows[:, None, :, None] * camera.width + columns[None, :, None, :]
@@ -108,10 +97,10 @@ class DepthResampler:
 
 
 class RealSenseDepthCamera:
-    """`DepthCamera` that reads LeRobot's ``RealSenseCamera``, which is connected and has its own
-    thread; raises `EnvironmentFailure` if its field of view is smaller than the policy's."""
+    """Reads LeRobot's ``RealSenseCamera``, which is connected and has its own thread; raises
+    `EnvironmentFailure` if its field of view is smaller than the policy's."""
 
-    def __init__(self, driver: Any, intrinsics: Intrinsics, vertical_fov: float) -> None:
+    def __init__(self, driver: Any, intrinsics: Any, vertical_fov: float) -> None:
         self._driver: Any | None = driver
         self._resample = DepthResampler(intrinsics, vertical_fov)
         if self._resample.coverage < _MIN_COVERAGE:
@@ -156,9 +145,7 @@ class RealSenseDepthCamera:
             ) from error
         try:
             stream = driver.rs_profile.get_stream(rs.stream.depth).as_video_stream_profile()
-            i = stream.get_intrinsics()
-            intrinsics = Intrinsics(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
-            return cls(driver, intrinsics, config.vertical_fov)
+            return cls(driver, stream.get_intrinsics(), config.vertical_fov)
         except BaseException:
             driver.disconnect()
             raise

@@ -8,7 +8,6 @@ and the run can be inspected again or shown to another model.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -18,8 +17,6 @@ from numpy.typing import NDArray
 from egovcp.errors import DataError, UsageError
 from egovcp.log.async_sink import warn_on_stderr
 from egovcp.log.mcap_reader import read_recording
-from egovcp.log.tick import CameraView
-from egovcp.robot_spec import RobotSpec
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
@@ -36,41 +33,21 @@ class ReplayRobot:
     """
 
     def __init__(self, files: Sequence[Path]) -> None:
-        self._files = files
+        self.files = files
         self._number = -1
+        self.controller_id = ""
         self.start(0)
 
-    @property
-    def count(self) -> int:
-        """Number of recordings."""
-        return len(self._files)
-
-    @property
-    def controller_id(self) -> str:
-        """Low-level controller of the recorded robot."""
-        return self._recording.info.hashes.get(_CONTROLLER, "")
-
-    @property
-    def spec(self) -> RobotSpec:
-        """The kind of robot."""
-        return self._recording.info.robot
-
-    @property
-    def camera(self) -> CameraView:
-        """The recorded mount."""
-        return self._recording.info.camera
-
     def start(self, episode: int) -> None:
-        """Go to the beginning of recording ``episode``; warns of missing ticks. Raises `UsageError`
-        if there is none, `DataError` if it is damaged or of another low-level controller."""
-        if not 0 <= episode < self.count:
-            raise UsageError(f"no recording {episode}; there are {self.count} recordings")
+        """Go to the beginning of recording ``episode``; warns of missing ticks. Raises `DataError`
+        if it is damaged or of another low-level controller."""
         if episode != self._number:
-            path = self._files[episode]
+            path = self.files[episode]
             recording = read_recording(path, damaged_ok=False)
             if not recording.ticks:
                 raise DataError(f"{path} has no ticks; there is nothing to play back")
-            found = recording.info.hashes.get(_CONTROLLER, "")
+            info = recording.info
+            found = info.hashes.get(_CONTROLLER, "")
             if self._number >= 0 and found != self.controller_id:
                 raise DataError(
                     f"{path} was recorded with the low-level controller {found!r}, expected "
@@ -83,22 +60,21 @@ class ReplayRobot:
                     f"warning: {path}: {missing} ticks are missing, and the policy's recurrence "
                     "differs from the recorded one after them; egovcp-mcap info lists the gaps"
                 )
-            self._recording = replace(recording, ticks=ticks)
-            self._number = episode
+            self.controller_id, self.spec, self.camera = found, info.robot, info.camera
+            self._ticks, self._number = ticks, episode
         self._tick = 0
 
     def observe(self) -> RobotObservation:
         """Return the recorded observation."""
-        tick = self._recording.ticks[self._tick]
+        tick = self._ticks[self._tick]
         state = np.asarray(tick.state, np.float32)
         return RobotObservation(tick.depth, state, tick.base, tick.scene)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
         """Return the recorded result, ignoring ``action``, and advance one tick."""
-        ticks = self._recording.ticks
-        tick = ticks[self._tick]
+        tick = self._ticks[self._tick]
         truncated, events = tick.truncated, tick.events
-        if self._tick + 1 < len(ticks):
+        if self._tick + 1 < len(self._ticks):
             self._tick += 1
         elif not tick.terminated:
             truncated, events = True, events if truncated else (*events, RECORDING_ENDS)

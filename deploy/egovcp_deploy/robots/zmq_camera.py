@@ -97,14 +97,12 @@ class ZmqCameraConfig:
 
 
 class ZmqDepthCamera:
-    """`DepthCamera` that receives from a depth server in a thread. Call `connect` first."""
+    """Receives from a depth server in a thread. Call `connect` first."""
 
     def __init__(self, config: ZmqCameraConfig | None = None) -> None:
         self.config = config or ZmqCameraConfig()
-        self.images = self.repeated = self.malformed = 0
-        """Numbers of messages received."""
-        self.problem = ""
-        """Why the last malformed message was dropped."""
+        self._malformed = 0  # messages
+        self._problem = ""  # of the last one
         self.arrivals = ArrivalMonitor(numbered=True)
         """Arrivals of usable images; missing and unusable ones count as lost."""
         self._newest: DepthImage | None = None
@@ -135,14 +133,12 @@ class ZmqDepthCamera:
                     f"expected {math.degrees(self.config.vertical_fov):.1f}"
                 )
         except MalformedMessage as error:
-            self.malformed += 1
-            self.problem = str(error)
+            self._malformed += 1
+            self._problem = str(error)
             self.arrivals.record_loss(time_ns)
             return False
         if frame.sequence == self._sequence:
-            self.repeated += 1
             return False
-        self.images += 1
         if self._sequence is not None:
             missing = (frame.sequence - self._sequence) % SEQUENCES - 1
             if 0 < missing < _MAX_MISSING:
@@ -161,10 +157,10 @@ class ZmqDepthCamera:
     def _timeout_reason(self, timeout: float) -> str:
         """Why no image arrived."""
         where = f"{self.config.host}:{self.config.port}"
-        if self.malformed:
+        if self._malformed:
             return (
-                f"{self.malformed} messages from {where}, none a usable depth image: "
-                f"{self.problem}; {_START}"
+                f"{self._malformed} messages from {where}, none a usable depth image: "
+                f"{self._problem}; {_START}"
             )
         if reason := connection_error(self.config.host, self.config.port):
             return f"no depth camera at {where} ({reason}); {_START}"

@@ -37,21 +37,14 @@ def make_evaluator(model: WorldModel, config: PlannerConfig) -> PlanEvaluator[Ca
     if backend == "eager" or (backend == "auto" and type(model) is not WorldModel):
         return ReferenceEvaluator(model, config)
     if backend == "int8":
-        return _int8_evaluator(model, config)
+        return Int8Evaluator(model, config)
     if backend == "auto" and model.state_mean.device.type == "cpu" and library.processor_is_fast():
         try:
             if library.library_if_possible() is not None:
-                return _int8_evaluator(model, config)
+                return Int8Evaluator(model, config)
         except UsageError as error:
             library.warn_float32(str(error))
     return FloatEvaluator(model, config)
-
-
-def _int8_evaluator(model: WorldModel, config: PlannerConfig) -> Int8Evaluator:
-    device = model.state_mean.device
-    if device.type != "cpu":
-        raise UsageError(f"backend=int8 runs on the CPU, the model is on {device}")
-    return Int8Evaluator(model, config)
 
 
 class FloatEvaluator:
@@ -69,12 +62,6 @@ class FloatEvaluator:
             self._prefix = GraphedFunction(self._prefix)
             self._plan_value = GraphedFunction(self._plan_value)
 
-    @property
-    def num_graphs(self) -> int:
-        """Number of captured CUDA graphs."""
-        parts = (self._prefix, self._plan_value)
-        return sum(f.num_graphs for f in parts if isinstance(f, GraphedFunction))
-
     @torch.no_grad()
     def at(self, carry: Carry) -> PlanValue:
         """See `PlanEvaluator`."""
@@ -91,14 +78,17 @@ class FloatEvaluator:
 class Int8Evaluator:
     """Evaluates one robot after the other in 8-bit integers, with as many threads as torch uses.
 
-    Later changes of the weights of the model, which is on the CPU, are not seen.
+    Later changes of the model's weights are not seen.
 
     Raises:
         EnvironmentFailure: the kernel cannot be built.
-        UsageError: the model has sizes that the kernel does not take.
+        UsageError: the model is not on the CPU, or has sizes that the kernel does not take.
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
+        device = model.state_mean.device
+        if device.type != "cpu":
+            raise UsageError(f"backend=int8 runs on the CPU, the model is on {device}")
         self._model, self._config = model, config
         self._network = IntegerNetwork(model, config)
 

@@ -263,15 +263,14 @@ def _cached(name: str, flags: Sequence[str]) -> bytes:
     except OSError as error:
         _warn_uncached(f"{error.filename or folder}: {error.strerror}")
         return _compile(flags)
-    with cache:
-        content = cache.read(name)
-        if content is None:
-            content = _compile(flags)
-            try:
-                cache.write(name, content)
-            except OSError as error:
-                _warn_uncached(f"{folder}: {error.strerror}")
-        return content
+    content = cache.read(name)
+    if content is None:
+        content = _compile(flags)
+        try:
+            cache.write(name, content)
+        except OSError as error:
+            _warn_uncached(f"{folder}: {error.strerror}")
+    return content
 
 
 def _warn_uncached(reason: str) -> None:

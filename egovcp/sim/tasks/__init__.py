@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from egovcp.robot_spec import Mirror, RobotSpec
     from egovcp.sim.mujoco_robot import MujocoRobot
     from egovcp.sim.scene import HANDS, HEAD, LEG, PARTS, TORSO, Contact
-    from egovcp.sim.tasks.base import Array, ObjectState, Task
+    from egovcp.sim.tasks.base import Array, Task
     from egovcp.sim.tasks.robot_task import RobotTask
     from egovcp.spec import ActionBox, Solid
 
@@ -29,7 +29,6 @@ __all__ = [
     "EpisodeConfig",
     "Mirror",
     "MujocoRobot",
-    "ObjectState",
     "Range",
     "RobotSpec",
     "RobotTask",
@@ -46,7 +45,7 @@ __all__ = [
 #: Imported on first use, because it needs MuJoCo; a robot has options without the simulator.
 _MODULES = {
     **dict.fromkeys(("HANDS", "HEAD", "LEG", "PARTS", "TORSO", "Contact"), "egovcp.sim.scene"),
-    **dict.fromkeys(("Array", "ObjectState", "Task"), "egovcp.sim.tasks.base"),
+    **dict.fromkeys(("Array", "Task"), "egovcp.sim.tasks.base"),
     **dict.fromkeys(("Mirror", "RobotSpec"), "egovcp.robot_spec"),
     **dict.fromkeys(("ActionBox", "Solid"), "egovcp.spec"),
     "MujocoRobot": "egovcp.sim.mujoco_robot",

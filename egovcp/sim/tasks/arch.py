@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from egovcp.bounds import bounded
-from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.base import Array, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import ACTION_BOX
 
@@ -171,9 +171,11 @@ class ArchTask(Task):
     def finished(self) -> bool:
         return self._passed
 
-    def state(self) -> ObjectState:
-        edge = self.robot.data.mocap_pos[self._mocap] + [0.0, 0.0, self.clearance]
-        return ObjectState(edge, np.zeros(3), self.clearance, self.under_way)
+    @property
+    def object_w(self) -> Array:
+        """(3,) the middle of the lintel's lower edge, m."""
+        edge: Array = self.robot.data.mocap_pos[self._mocap] + [0.0, 0.0, self.clearance]
+        return edge
 
     def oracle(self) -> Array:
         """Squat as deep as the clearance requires while the arch is near."""

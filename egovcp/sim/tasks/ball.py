@@ -16,7 +16,7 @@ import numpy as np
 
 from egovcp.bounds import bounded
 from egovcp.sim.scene import HANDS, HEAD, LEG, TORSO, Contact
-from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.base import Array, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import Solid
 
@@ -213,21 +213,18 @@ class BallTask(Task):
     def finished(self) -> bool:
         return self._grounded
 
-    def state(self) -> ObjectState:
-        over = self._grounded or self.hit or self.blocked
-        if not self._thrown:
-            nothing = np.full(3, np.nan)
-            return ObjectState(nothing, nothing.copy(), self.radius, active=False)
-        velocity = self.robot.data.qvel[self._qvel][:3].copy()
-        return ObjectState(self._pose[:3], velocity, self.radius, active=not over)
+    @property
+    def object_w(self) -> Array:
+        """(3,) centre of the ball, m."""
+        return self._pose[:3] if self._thrown else np.full(3, np.nan)
 
     def oracle(self) -> Array:
         """Put the nearer hand where the ball will cross a plane ahead of the body."""
-        state = self.state()
-        if not state.active:
+        if not self._thrown or self._grounded or self.hit or self.blocked:
             return np.zeros(7)
         t = _LOOKAHEAD[:, None]
-        path = self.object_b + self.to_heading_frame(state.velocity_w) * t + 0.5 * _GRAVITY * t * t
+        velocity = self.to_heading_frame(self.robot.data.qvel[self._qvel][:3])
+        path = self.object_b + velocity * t + 0.5 * _GRAVITY * t * t
         point = path[np.argmin(np.abs(path[:, 0] - _BLOCK_AHEAD))]
         target = point - _HAND_OFFSET
         return self.action_of(left=target) if point[1] > 0 else self.action_of(right=target)

@@ -15,7 +15,7 @@ import numpy as np
 
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.sim.scene import PARTS, Contact
-from egovcp.sim.tasks.base_task import Array, BaseTask, ObjectState
+from egovcp.sim.tasks.base_task import Array, BaseTask
 from egovcp.spec import (
     ACTION_BOX,
     CONTROLLER_TICKS_PER_PLAN,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from egovcp.sim.robot import SimulatedRobot
     from egovcp.sim.scenario import Scenario
 
-__all__ = ["Array", "ObjectState", "Task"]
+__all__ = ["Array", "Task"]
 
 PHYSICS_STEPS_PER_TICK: Final = CONTROLLER_TICKS_PER_PLAN * PHYSICS_STEPS_PER_CONTROLLER_TICK
 FALL_HEIGHT: Final = 0.40  # m, pelvis; the lowest command is 0.52
@@ -95,7 +95,7 @@ class Task(BaseTask):
     @property
     def object_b(self) -> Array:
         """(3,) position of the object, m, pelvis heading frame."""
-        return self.to_heading_frame(self.state().position_w - self.robot.data.qpos[:3])
+        return self.to_heading_frame(self.object_w - self.robot.data.qpos[:3])
 
     @staticmethod
     def action_of(

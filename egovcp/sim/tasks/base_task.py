@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import mujoco
@@ -22,18 +21,6 @@ if TYPE_CHECKING:
     from egovcp.sim.scenario import Scenario
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ObjectState:
-    """State of the task's object; quantities that a task lacks are NaN."""
-
-    position_w: Array
-    """(3,) the point that matters, m: such as the centre of a ball or the nearest point of a wall.
-    The world model learns to locate it in the images."""
-    velocity_w: Array  # (3,) m/s
-    size: float  # Such as a radius, m
-    active: bool  # Whether the robot has to act now
 
 
 class BaseTask(ABC):
@@ -129,9 +116,11 @@ class BaseTask(ABC):
     def achieved(self) -> bool:
         """`success`, regardless of falls. It never ends an episode."""
 
+    @property
     @abstractmethod
-    def state(self) -> ObjectState:
-        """State of the object."""
+    def object_w(self) -> Array:
+        """(3,) the point that matters, m, world: such as the centre of a ball or the nearest point
+        of a wall; NaN while there is none. The world model learns to locate it in the images."""
 
     def oracle(self) -> Array:
         """(A,) action of the scripted solution, which may use the whole state of the simulator.
@@ -199,7 +188,7 @@ class BaseTask(ABC):
 
     @property
     def current_name(self) -> str:
-        """Name of the current task, whose object `state` describes."""
+        """Name of the current task, whose object `object_w` is."""
         return self.name
 
     @property

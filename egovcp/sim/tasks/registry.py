@@ -33,11 +33,6 @@ DEFAULT_TASK: Final = "ball"
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
 _COLUMNS: Final = tuple(name for name in REWARD_TERMS if name not in (*ACTION_TERMS, "fall"))
-#: Options of the environment besides those of tasks, and other words with a meaning.
-_RESERVED: Final = (
-    *("pose_cost", "action_rate_cost", "controller", "feet", "camera", "sensors", "delay"),
-    *("randomise", "threads", ALL_TASKS),
-)
 
 
 @dataclass(frozen=True)
@@ -74,7 +69,8 @@ def task_entries() -> tuple[TaskEntry, ...]:
         if not all(map(is_installed, SIMULATOR_MODULES)):
             return ()
         _found = []  # a plugin may use the registry while it is imported
-        for point in sorted(_points(), key=lambda p: (p.dist.name != "egovcp", p.dist.name)):
+        points: Iterable[Any] = metadata.entry_points(group=GROUP)
+        for point in sorted(points, key=lambda p: (p.dist.name != "egovcp", p.dist.name)):
             _add(point.name, f"{point.dist.name} {point.dist.version}", point.value)
         for reference in filter(None, os.environ.get(VARIABLE, "").split(",")):
             _add("", reference, reference)
@@ -83,10 +79,6 @@ def task_entries() -> tuple[TaskEntry, ...]:
                 if entry.problem:
                     echo(f"warning: {entry.failure}", error=True)
     return tuple(sorted(_found, key=_place))
-
-
-def _points() -> Iterable[Any]:
-    return metadata.entry_points(group=GROUP)
 
 
 def _place(entry: TaskEntry) -> tuple[float, str]:
@@ -98,7 +90,9 @@ def _add(name: str, origin: str, reference: str) -> TaskEntry:
     """Import ``module:Class`` and append its entry; an empty ``name`` is that of the class."""
     assert _found is not None
     try:
-        task = _load(reference)
+        from egovcp.sim.tasks.base_task import BaseTask
+
+        task = import_class(reference, BaseTask, "Task or RobotTask of egovcp.sim.tasks")  # type: ignore[type-abstract]
         _check(task)
         if name and name != task.name:
             raise ValueError(f"the class {reference} is named {task.name!r}; use one name")
@@ -111,12 +105,6 @@ def _add(name: str, origin: str, reference: str) -> TaskEntry:
         entry = TaskEntry(name or reference, origin, None, kind + " ".join(str(error).split()))
     _found.append(entry)
     return entry
-
-
-def _load(reference: str) -> type[BaseTask]:
-    from egovcp.sim.tasks.base_task import BaseTask
-
-    return import_class(reference, BaseTask, "Task or RobotTask of egovcp.sim.tasks")  # type: ignore[type-abstract]
 
 
 def _check(task: type[BaseTask]) -> None:
@@ -155,12 +143,15 @@ def _missing_of_robot(task: type[BaseTask]) -> list[str]:
 
 def name_problem(name: str) -> str:
     """Why a task cannot have this name; empty: it can."""
+    from egovcp.sim.config import BaseEnvConfig
+
+    reserved = [*(option.name for option in dataclasses.fields(BaseEnvConfig)), ALL_TASKS]
     wrong = not _NAME.fullmatch(name) or keyword.iskeyword(name)
-    if not wrong and name not in _RESERVED and not name.endswith("_episode"):
+    if not wrong and name not in reserved and not name.endswith("_episode"):
         return ""
     return (
         f"{name!r} cannot be the name of a task: use lower-case letters, digits and _, and no "
-        f"Python keyword, NAME_episode, {', '.join(_RESERVED)}"
+        f"Python keyword, NAME_episode, {', '.join(reserved)}"
     )
 
 

@@ -25,7 +25,7 @@ class RobotTask(BaseTask):
     Class attributes describe the task, `add_objects` adds its objects to the scene of the robot.
     Per episode: ``__init__`` samples parameters, `place` sets the start state. Then, per physics
     step: `before_step`, physics, `after_step`; per planner tick: `rewards`. All randomness comes
-    from `sample` and `scenario`. Positions of `state` are in the world.
+    from `sample` and `scenario`.
     """
 
     robot_class: ClassVar[type[MujocoRobot]]
@@ -54,13 +54,23 @@ class RobotTask(BaseTask):
         return [tuple(row.tolist()) for row in rows]
 
     @classmethod
+    @cache
     def scene(cls) -> mujoco.MjModel:
         """The model of robot and objects, compiled once.
 
         Raises:
             EnvironmentFailure: it does not compile, or does not fit the robot's description.
         """
-        return _scene(cls)
+        try:
+            spec = cls.robot_class.build()
+            cls.add_objects(spec)
+            model = spec.compile()
+            cls.robot_class(model)
+        except EgovcpError:
+            raise
+        except Exception as error:
+            raise cls.error(f"its scene cannot be made: {error}") from error
+        return model
 
     def after_step(self) -> None:
         """Look at the scene after a physics step, such as for contacts."""
@@ -93,23 +103,8 @@ class RobotTask(BaseTask):
         pose = self.robot.base_pose
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, pose[3:])
-        position: Array = (self.state().position_w - pose[:3]) @ rotation.reshape(3, 3)
+        position: Array = (self.object_w - pose[:3]) @ rotation.reshape(3, 3)
         return position
-
-
-@cache
-def _scene(cls: type[RobotTask]) -> mujoco.MjModel:
-    robot = cls.robot_class
-    try:
-        spec = robot.build()
-        cls.add_objects(spec)
-        model = spec.compile()
-        robot(model)
-    except EgovcpError:
-        raise
-    except Exception as error:
-        raise cls.error(f"its scene cannot be made: {error}") from error
-    return model
 
 
 @cache

@@ -17,7 +17,7 @@ from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
-from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.base import Array, Task
 from egovcp.sim.tasks.options import MAX_TICKS, EpisodeConfig
 from egovcp.sim.tasks.registry import find_task
 from egovcp.sim.tasks.wall import WallTask
@@ -201,8 +201,9 @@ class SequenceTask(Task):
             for k, part in enumerate(self._parts)
         }
 
-    def state(self) -> ObjectState:
-        return self._part.state()
+    @property
+    def object_w(self) -> Array:
+        return self._part.object_w
 
     def solids(self) -> tuple[Solid, ...]:
         return self._part.solids()

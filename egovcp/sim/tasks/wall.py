@@ -12,7 +12,7 @@ import numpy as np
 
 from egovcp.bounds import bounded
 from egovcp.sim.scene import HANDS, Contact
-from egovcp.sim.tasks.base import Array, ObjectState, Task
+from egovcp.sim.tasks.base import Array, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import PHYSICS_DT
 
@@ -137,16 +137,17 @@ class WallTask(Task):
         """Nothing but hands has touched the wall."""
         return not self._hit
 
-    def state(self) -> ObjectState:
-        """Where the pelvis' x axis meets the wall; active while disturbed towards it."""
+    @property
+    def object_w(self) -> Array:
+        """(3,) where the pelvis' x axis meets the wall, m."""
         pelvis, forward = self.robot.data.qpos[:3], self.robot.heading[:, 0]
         gap = (self._surface - pelvis) @ self._normal / max(float(forward @ self._normal), 0.1)
-        point = pelvis + gap * forward
-        return ObjectState(point, np.zeros(3), math.nan, self.disturbed and not self.away)
+        point: Array = pelvis + gap * forward
+        return point
 
     def oracle(self) -> Array:
         """After a push towards the wall, press both hands on it."""
-        if not self.state().active:
+        if self.away or not self.disturbed:
             return np.zeros(7)
         ahead = self.object_b[0] + _PRESS
         left, right = (ahead, _PRESS_ASIDE, _PRESS_HEIGHT), (ahead, -_PRESS_ASIDE, _PRESS_HEIGHT)

@@ -10,7 +10,6 @@ from arm_robot import HEIGHT, PlanarArm, inverse_kinematics
 from egovcp.sim.tasks import (
     Array,
     EpisodeConfig,
-    ObjectState,
     Range,
     RobotTask,
     TaskConfig,
@@ -90,9 +89,9 @@ class ReachTask(RobotTask):
     def achieved(self) -> bool:
         return self._distance < self.config.tolerance
 
-    def state(self) -> ObjectState:
-        place = self._goal if self._shown else np.full(3, np.nan)
-        return ObjectState(place, np.zeros(3), RADIUS, self._shown)
+    @property
+    def object_w(self) -> Array:
+        return self._goal if self._shown else np.full(3, np.nan)
 
     def oracle(self) -> Array:
         return np.clip(self.robot.spec.action_box.to_normalised(self._angles), -1.0, 1.0)

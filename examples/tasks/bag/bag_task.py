@@ -19,7 +19,6 @@ from egovcp.sim.tasks import (
     Array,
     Contact,
     EpisodeConfig,
-    ObjectState,
     Range,
     Task,
     TaskConfig,
@@ -114,8 +113,10 @@ class BagTask(Task):
         self._caught = self._caught or bool(parts & set(HANDS))
 
     def rewards(self) -> dict[str, float]:
-        leaves = self.state().velocity_w @ self._from > 0.0
-        self._stopped = self._stopped or (self._caught and not self._hit and bool(leaves))
+        velocity, kind = np.empty(6), mujoco.mjtObj.mjOBJ_BODY
+        mujoco.mj_objectVelocity(self.robot.model, self.robot.data, kind, self._body, velocity, 0)
+        leaves = bool(velocity[3:] @ self._from > 0.0)
+        self._stopped = self._stopped or (self._caught and not self._hit and leaves)
         return {
             "stop": self.config.stop_reward * self.once("stop", self._stopped),
             "hit": -self.config.hit_cost * self.once("hit", self._hit),
@@ -126,12 +127,10 @@ class BagTask(Task):
         """Stopped by the hands and never on the body; in an empty episode, always."""
         return not self._hit and (self._stopped or self.event_tick is None)
 
-    def state(self) -> ObjectState:
-        data, velocity = self.robot.data, np.empty(6)
-        kind = mujoco.mjtObj.mjOBJ_BODY
-        mujoco.mj_objectVelocity(self.robot.model, data, kind, self._body, velocity, 0)
-        active = self.since_event >= 0.0 and not (self._stopped or self._hit)
-        return ObjectState(data.xpos[self._body].copy(), velocity[3:], RADIUS, active)
+    @property
+    def object_w(self) -> Array:
+        place: Array = self.robot.data.xpos[self._body].copy()
+        return place
 
     def oracle(self) -> Array:
         """Hold both hands into the plane of the swing, until the bag has lost its momentum."""

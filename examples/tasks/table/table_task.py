@@ -16,7 +16,6 @@ from egovcp.sim.tasks import (
     Array,
     Contact,
     EpisodeConfig,
-    ObjectState,
     Range,
     Task,
     TaskConfig,
@@ -113,15 +112,15 @@ class TableTask(Task):
         """Both hands on the table and nothing else; in an empty episode, nothing touched it."""
         return not self._hit and (self._braced or self.event_tick is None)
 
-    def state(self) -> ObjectState:
+    @property
+    def object_w(self) -> Array:
         """The middle of the edge."""
-        return ObjectState(
-            self._edge.copy(), np.zeros(3), math.nan, active=0.0 <= self.since_event < 1.5
-        )
+        edge: Array = self._edge.copy()
+        return edge
 
     def oracle(self) -> Array:
         """After the push, press both hands on the top behind the edge."""
-        if not self.state().active:
+        if not 0.0 <= self.since_event < 1.5:
             return np.zeros(7)
         aside = np.array([-self._away[1], self._away[0], 0.0])
         place = self._edge + 0.12 * self._away - self.robot.data.qpos[:3] - [0.0, 0.0, 0.06]

@@ -14,7 +14,7 @@ from egovcp.eval_scores import EvalScores
 from egovcp.sim.config import evaluation_config
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
-from egovcp_experiment.grid import BOUNDS, Grid
+from egovcp_experiment.grid import REFERENCES, Grid
 from egovcp_experiment.report import ExperimentReport, percent
 
 _PLANNER: Final = "planner"
@@ -79,9 +79,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     for task in config.tasks:
         planner = results.eval_scores(records, grid.plays(task), task)
         ppo = ppo_scores(grid, task, records)
-        bounds = results.controller_scores(records, grid.bounds(task), task, BOUNDS)
+        cell = grid.references(task)
+        references = results.controller_scores(records, cell, task, REFERENCES)
         ours = {} if planner is None else {_PLANNER: planner}
-        shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **bounds}
+        shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **references}
         if ppo:
             offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
             curves = [results.Curve("PPO", ppo, "C1", "x--")]
@@ -89,7 +90,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
                 curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
             caption = f"{task}: success and reward against transitions"
             page.sections.append(results.learning_curves(task, caption, curves))
-            page.findings += _conclusions(task, offline, planner, ppo, bounds)
+            page.findings += _conclusions(task, offline, planner, ppo, references)
             page.figures[task] = {"planner_transitions": offline}
         if shown:
             page.sections.append(results.comparison(task, shown, _PLANNER))
@@ -102,7 +103,7 @@ def _conclusions(
     offline: int,
     planner: EvalScores | None,
     ppo: Mapping[int, EvalScores],
-    bounds: Mapping[str, EvalScores],
+    references: Mapping[str, EvalScores],
 ) -> list[str]:
     count, last = list(ppo.items())[-1]
     lines = []
@@ -112,10 +113,9 @@ def _conclusions(
             f"{steps_text(offline)}, PPO {percent(last.success_rate)} after {steps_text(count)}: "
             f"PPO is {_versus(last, planner)}"
         )
-    if "hold" in bounds:
-        lines.append(
-            f"{task}: compared with the neutral pose, PPO is {_versus(last, bounds['hold'])}"
-        )
+    if "hold" in references:
+        versus = _versus(last, references["hold"])
+        lines.append(f"{task}: compared with the neutral pose, PPO is {versus}")
     if len(ppo) > 1:
         first = next(iter(ppo.values()))
         lines.append(

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.experiments.ppo import ppo_scores, steps_per_episode, steps_text
-from egovcp_experiment.grid import BOUNDS, Grid, Model
+from egovcp_experiment.grid import REFERENCES, Grid, Model
 from egovcp_experiment.report import ExperimentReport, Part
 
 
@@ -32,7 +32,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     for task in config.tasks:
         models = {part: _model(grid, task, part) for part in sorted(config.data.parts)}
         plays = {part: grid.plays(task, m.name, model=m) for part, m in models.items()}
-        bounds = grid.bounds(task)
+        references = grid.references(task)
         ppo = ppo_scores(grid, task, records)
         scores = results.all_scores(records, plays, task)
         if not scores:
@@ -47,7 +47,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         shown = {
             **named,
             **{f"PPO, {steps_text(n)}": each for n, each in ppo.items()},
-            **results.controller_scores(records, bounds, task, BOUNDS),
+            **results.controller_scores(records, references, task, REFERENCES),
         }
         tables.append(results.comparison(task, shown, list(named)[-1]))
         page.findings.append(_conclusion(task, named))

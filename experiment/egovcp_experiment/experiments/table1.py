@@ -14,7 +14,7 @@ from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import BOUNDS, Grid
+from egovcp_experiment.grid import REFERENCES, Grid
 from egovcp_experiment.report import ExperimentReport, Table, number, percent
 
 type Scores = dict[str, dict[str, EvalScores]]
@@ -128,7 +128,7 @@ ROWS: Final[dict[str, Row]] = {
     },
     "arwm": Row("ARWM", "reward_arwm", _plan("value"), (0.0609, 0.0039, -0.0018)),
     "rew_mpc": Row("Rew-MPC", "reward", _plan("reward"), (0.0302, -0.0033, -0.0211)),
-    "td_mpc_mc": Row("TD-MPC, Q by MC", "reward", _plan("td"), _TD_MPC),
+    "td_mpc": Row("TD-MPC, Q as in ours", "reward", _plan("td"), _TD_MPC),
     "td_mpc_td": Row("TD-MPC, Q by TD", "reward_td", _plan("td"), _TD_MPC),
 }
 OURS: Final = "ours_n4"
@@ -137,8 +137,8 @@ CLAIMS: Final = (
     Claim(OURS, "ours_n1", ("ball", "wall", "arch")),
     Claim(OURS, "arwm", ("ball", "arch")),
     Claim(OURS, "rew_mpc", ("ball", "wall", "arch")),
-    Claim(OURS, "td_mpc_mc", ("ball", "arch")),
-    Claim("td_mpc_mc", OURS, ("wall",)),
+    Claim(OURS, "td_mpc", ("ball", "arch")),
+    Claim("td_mpc", OURS, ("wall",)),
     Claim(OURS, "td_mpc_td", ("ball", "arch")),
     Claim("td_mpc_td", OURS, ("wall",)),
 )
@@ -183,14 +183,14 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         title = "Differences, above - below, on the same scenarios"
         page.sections.append(Table(title, head, [verdict.row() for verdict in verdicts]))
     for task in config.tasks:
-        cell = grid.bounds(task)
+        cell = grid.references(task)
         if task in scores:
-            bounds = results.controller_scores(records, cell, task, BOUNDS)
+            references = results.controller_scores(records, cell, task, REFERENCES)
             titled = {ROWS[name].title: each for name, each in scores[task].items()}
             ours = ROWS[OURS].title
-            page.sections.append(results.comparison(task, {**titled, **bounds}, ours))
+            page.sections.append(results.comparison(task, {**titled, **references}, ours))
             page.sections.append(results.comparison_plot(task, task, titled, ours))
-            page.figures[task] = results.figures_of({**scores[task], **bounds})
+            page.figures[task] = results.figures_of({**scores[task], **references})
     return page
 
 

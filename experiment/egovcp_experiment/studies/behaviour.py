@@ -94,7 +94,7 @@ def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) 
     """One trace per episode."""
     traces = [BehaviourTrace() for _ in range(config.episodes)]
     for step in study.play_episodes(artifact, env_config, config):
-        state, force = step.state, step.env.privileged_state().contact_force
+        state = step.state
         for row in step.live:
             trace = traces[step.scenarios[row].episode]
             trace.since.append(float(state.since_event[row]))
@@ -104,7 +104,7 @@ def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) 
             trace.speed.append(float(np.hypot(*state.pelvis_velocity_w[row, :2])))
             trace.ahead.append(float(state.object_b[row, 0]))
             trace.away = abs(step.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
-            trace.touched |= bool(force[row].any())
+            trace.touched |= bool(step.env.instances[row].task.forces.any())
             trace.fallen = bool(step.result.terminated[row])
     return traces
 

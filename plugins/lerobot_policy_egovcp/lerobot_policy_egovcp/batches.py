@@ -19,20 +19,14 @@ from egovcp.data.source import read_source
 from egovcp.errors import DataError, UsageError
 from egovcp.model import Batch
 from egovcp.robot_spec import G1
+from lerobot_policy_egovcp.configuration_egovcp import FEATURE_SHAPES
 
 _COLUMNS = (
     *(spec.REWARD_KEY, spec.REWARD_TERMS_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY),
     spec.OBJECT_KEY,
 )
-_SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
-    spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
-    spec.STATE_KEY: (spec.STATE_DIM,),
-}
 _CHANNEL_LAST: Final = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
-_NUMBERS: Final = (
-    *(torch.uint16, torch.int16, torch.int32, torch.uint32, torch.int64),
-    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
-)
+_UNUSABLE: Final = (torch.bool, torch.uint8, torch.int8)  # too small for millimetres
 _EXPECTED: Final = {
     spec.DEPTH_KEY: "millimetres as uint16, int32 or float32",
     spec.STATE_KEY: "numbers, such as float32",
@@ -68,7 +62,7 @@ def to_millimetres(depth: Tensor) -> Tensor:
     or another unit.
     """
     _require_type(spec.DEPTH_KEY, depth)
-    if tuple(depth.shape[-3:]) != _SHAPES[spec.DEPTH_KEY]:
+    if tuple(depth.shape[-3:]) != FEATURE_SHAPES[spec.DEPTH_KEY]:
         raise _wrong_shape(spec.DEPTH_KEY, depth, "(..., {})")
     # torch has no arithmetic for uint16
     finite = depth.squeeze(-3).float().nan_to_num(0.0, 0.0, 0.0)
@@ -97,7 +91,7 @@ def _part(batch: Mapping[str, Any], key: str) -> Tensor:
     _require_type(key, value)
     if tuple(value.shape[-3:]) == _CHANNEL_LAST:
         value = value.movedim(-1, -3)
-    shape = _SHAPES[key]
+    shape = FEATURE_SHAPES[key]
     missing = len(shape) + 1 - value.ndim
     if tuple(value.shape[-len(shape) :]) != shape or missing not in (0, 1):
         raise _wrong_shape(key, value, "(E, {0}) for E robots, or ({0}) for one")
@@ -105,13 +99,13 @@ def _part(batch: Mapping[str, Any], key: str) -> Tensor:
 
 
 def _require_type(key: str, value: Tensor) -> None:
-    if value.dtype not in _NUMBERS:
+    if value.dtype in _UNUSABLE:
         name = str(value.dtype).removeprefix("torch.")
         raise DataError(f"{key} has type {name}; expected {_EXPECTED[key]}")
 
 
 def _wrong_shape(key: str, value: Tensor, expected: str) -> DataError:
-    shape = expected.format(", ".join(map(str, _SHAPES[key])))
+    shape = expected.format(", ".join(map(str, FEATURE_SHAPES[key])))
     return DataError(f"{key} has shape {tuple(value.shape)}; expected {shape}")
 
 

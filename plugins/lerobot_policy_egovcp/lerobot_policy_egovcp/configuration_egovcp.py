@@ -77,7 +77,8 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
         require_compatible(self.world_model, self.planner)
         require_affordable(self.world_model, self.planner)
         self._check_losses()
-        if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):
+        modes = map(NormalizationMode, self.normalization_mapping.values())
+        if any(mode is not NormalizationMode.IDENTITY for mode in modes):
             raise UsageError(
                 "the world model normalises by itself; leave --policy.normalization_mapping alone"
             )
@@ -92,9 +93,6 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
         if self.world_model.dynamics == "autoregressive":
             steps = loss.autoregressive_steps
             require_longer(self.sequence_length, steps, "--policy.sequence_length")
-
-    def _modes(self) -> list[NormalizationMode]:
-        return [NormalizationMode(mode) for mode in self.normalization_mapping.values()]
 
     @property
     def observation_delta_indices(self) -> list[int]:

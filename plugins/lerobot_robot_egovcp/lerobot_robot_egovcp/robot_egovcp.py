@@ -13,7 +13,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp_deploy.live.external_policy import ExternalPolicyRobot
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
+from egovcp_deploy.live.hardware import CameraOptions, RobotOptions
 from egovcp_deploy.live.operators import AutomaticOperator
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -42,8 +42,14 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     remote control: Y, A, start."""
 
     @property
-    def setup(self) -> ControlSetup:
-        return ControlSetup(self.bridge, self.camera, self.controller, self.limits)
+    def options(self) -> RobotOptions:
+        return RobotOptions(
+            "unitree_g1",
+            controller=self.controller,
+            bridge=self.bridge,
+            camera=self.camera,
+            limits=self.limits,
+        )
 
 
 class EgovcpG1(Robot):  # type: ignore[misc]
@@ -89,7 +95,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         if self._robot is not None:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
         operator = AutomaticOperator() if self.config.by_itself else None
-        robot = ExternalPolicyRobot(self.config.setup, operator)
+        robot = ExternalPolicyRobot(self.config.options, operator)
         robot.connect()
         self._robot = robot
 

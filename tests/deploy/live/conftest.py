@@ -72,10 +72,16 @@ KNEE = JOINT_NAMES.index("left_knee_joint")
 class SimBody:
     """Motors and IMU of a `LiveRobot`; remembers every command."""
 
+    fault = rejected = ""
+
     def __init__(self, robot: LiveRobot, clock: LockstepClock, faults: Faults) -> None:
         self._robot, self._clock, self._faults = robot, clock, faults
         self._last: LowState | None = None
         self.commands: list[MotorCommand] = []
+
+    @property
+    def refusal(self) -> str:
+        return self._faults.refusal
 
     def read(self) -> LowState | None:
         if self._faults.frozen or self._faults.silent:
@@ -228,13 +234,8 @@ def make_rig() -> Callable[..., Rig]:
         planner = EventPlanner(runner, lambda tick: delay_ms(tick) * 1_000_000)
         planner.events = []
         controller = StanceController()
-        loop = ControlLoop(
-            body,
-            SimEye(robot, clock, faults),
-            controller,
-            Pilot(planner, Limits()),
-            refusal=lambda: faults.refusal,
-        )
+        camera = SimEye(robot, clock, faults)
+        loop = ControlLoop(body, camera, controller, Pilot(planner, Limits()))
         return Rig(robot, clock, faults, body, policy, controller, loop, planner.events)
 
     return make

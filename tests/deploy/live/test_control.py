@@ -72,7 +72,7 @@ def test_the_robot_stands_and_reaches_the_planned_targets(make_rig: Make) -> Non
     assert rig.loop.state is State.RUN
     assert rig.robot.robot.pelvis_height > 0.7
     np.testing.assert_allclose(rig.loop.pilot.sent[:6], 0.5)
-    palms = (rig.robot.robot.palms_w - rig.robot.robot.data.qpos[:3]) @ rig.robot.robot.heading
+    palms = rig.robot.robot.palms_b
     wanted = ACTION_BOX.to_metric(rig.loop.pilot.sent)[:6].reshape(2, 3)
     assert np.abs(palms - wanted).max() < 0.1
     assert_sane(rig.body.commands)

@@ -28,7 +28,7 @@ from egovcp.sim.live import LiveRobot, Phase
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.live.control_process import ControlProcess, merged
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, open_hardware
+from egovcp_deploy.live.hardware import CameraOptions, RobotOptions, open_hardware
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.live.operators import AutomaticOperator, RemoteOperator
 from egovcp_deploy.live.planner_loop import PlannerLoop
@@ -36,8 +36,7 @@ from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
-from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from tests.support.lockstep import LockstepClock
@@ -87,11 +86,11 @@ def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
     bridge = bridge_config(fake)
     camera = CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
     address = f"ipc://{folder}/link"
-    setup = ControlSetup(bridge, camera, "stance", PATIENT, address, os.getppid())
+    options = RobotOptions(controller="stance", bridge=bridge, camera=camera, limits=PATIENT)
     ours, theirs = Link(address, serve=True), Link(address, serve=False)
     stopping: list[int] = []
     with closing(open_hardware(bridge, camera)) as hardware, closing(ours), closing(theirs):
-        control = ControlProcess(setup, hardware, theirs)
+        control = ControlProcess(options, os.getppid(), hardware, theirs)
         thread = threading.Thread(target=control.run, args=(stopping,))
         thread.start()
         sink = McapSink(file)
@@ -145,7 +144,7 @@ def test_a_blocked_terminal_does_not_stop_the_loop(
             os.write(writer, bytes(1 << 16))
     os.set_blocking(writer, True)
     hardware = SimpleNamespace(body=SimpleNamespace(read=lambda: None), camera=None, link=None)
-    setup = ControlSetup(BridgeConfig(), CameraOptions(), "stance", Limits(), parent=0)  # has ended
+    options, parent = RobotOptions(controller="stance"), 0  # has ended
     ticks, stopping, enough = list[int](), list[int](), threading.Event()
 
     def tick(now_ns: int, command: OperatorCommand) -> None:
@@ -155,7 +154,7 @@ def test_a_blocked_terminal_does_not_stop_the_loop(
 
     pilot = SimpleNamespace(add_events=lambda events: None)
     with open(writer, "w") as full, closing(Link(f"ipc://{tmp_path}/link", serve=True)) as link:
-        control = ControlProcess(setup, hardware, link)
+        control = ControlProcess(options, parent, hardware, link)
         control._loop = SimpleNamespace(state=State.RUN, tick=tick, pilot=pilot)
         monkeypatch.setattr(sys, "stderr", full)
         thread = threading.Thread(target=control.run, args=(stopping,))
@@ -181,9 +180,9 @@ def run(stopping):
 c.open_hardware = lambda bridge, camera: hardware
 c.Link = lambda address, serve: Stub(close=lambda: None)
 c.raise_priority = lambda level: False
-c.ControlProcess = lambda setup, hardware, link: Stub(run=run, add_event=lambda event: print(event))
+c.ControlProcess = lambda *arguments: Stub(run=run, add_event=lambda event: print(event))
 c.damp_motors = lambda body: print("damped")
-c.control_process(Stub(bridge=None, camera=None, address=""))
+c.control_process(Stub(bridge=None, camera=None), "", 0)
 """
 
 

@@ -23,7 +23,7 @@ from egovcp.log.mcap_reader import read_recording
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.pilot.states import State
-from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from tests.support.robots.fake_g1 import FakeG1Thread, eventually, fake_g1_process
 
 from .conftest import PATIENT, QUICK

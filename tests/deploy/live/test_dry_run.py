@@ -17,7 +17,7 @@ from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
 from egovcp_deploy.dry_run import check_message_rate, check_posture, image_age, joint_offsets
 from egovcp_deploy.robots.base import LowState
-from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.subscriber import ArrivalStats
 from tests.support.robots.fake_g1 import FakeG1Thread
 from tests.support.robots.fault_messages import edited, without_motor_fields

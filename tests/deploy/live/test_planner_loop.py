@@ -98,12 +98,7 @@ class Broken(MemorySink):
 
 
 @pytest.fixture
-def warnings() -> list[str]:
-    return []
-
-
-@pytest.fixture
-def make_loop(warnings: list[str]) -> Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]:
+def make_loop() -> Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]:
     """A loop whose planner fails in tick 5, with a control process of 200 ticks."""
 
     def make(
@@ -121,7 +116,6 @@ def make_loop(warnings: list[str]) -> Callable[..., tuple[ControlStub, PlannerLo
             log,
             clock,
             control.alive,
-            warn=warnings.append,
         )
         return control, loop, log
 
@@ -129,7 +123,8 @@ def make_loop(warnings: list[str]) -> Callable[..., tuple[ControlStub, PlannerLo
 
 
 def test_a_planner_that_raises_holds_the_robot_and_the_log_continues(
-    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]], warnings: list[str]
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     control, loop, log = make_loop()
     summary = loop.run()
@@ -141,10 +136,8 @@ def test_a_planner_that_raises_holds_the_robot_and_the_log_continues(
     assert [tick.index for tick in log.ticks] == list(range(200))
     assert log.ticks[-1].events[-1] == "end of the run: the control process is gone"
     assert "the planner failed: RuntimeError: out of ideas" in log.ticks[5].events
-    assert len(warnings) == 1
-    assert warnings[0].startswith(
-        "the planner failed: RuntimeError: out of ideas; the robot is held"
-    )
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert warning.startswith("the planner failed: RuntimeError: out of ideas; the robot is held")
 
 
 def test_the_operator_ends_the_run_after_a_failure(

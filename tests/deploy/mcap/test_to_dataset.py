@@ -186,7 +186,7 @@ def test_a_run_whose_beginning_is_missing_is_refused(
     assert "its first ticks are missing" in capsys.readouterr().err
 
 
-def test_the_same_rollout_twice_is_refused_before_anything_is_written(
+def test_the_same_rollout_twice_is_refused_and_nothing_remains(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = record()

@@ -11,7 +11,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.wall import WallConfig
 from egovcp_deploy.robots.bridge import BridgeRobot
-from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, bridge_config
 
 SHORT = EpisodeConfig(ticks=20, event_ticks=(3, 4), empty_probability=0.0)

@@ -13,8 +13,7 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp_deploy.robots.base import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot, mode_refusal, mode_warning
-from egovcp_deploy.robots.fake import FakeBridge
-from egovcp_deploy.robots.fake.bridge import MODE
+from egovcp_deploy.robots.fake.bridge import MODE, FakeBridge
 from egovcp_deploy.robots.wire import encode_command
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
 from tests.support.ports import free_port

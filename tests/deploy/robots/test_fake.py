@@ -17,9 +17,9 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.robots.base import MotorCommand, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
-from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
-from egovcp_deploy.robots.fake.bridge import MODE, WATCHDOG_S
+from egovcp_deploy.robots.fake.bridge import MODE, WATCHDOG_S, FakeBridge, Ports
 from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config, outcome_text
+from egovcp_deploy.robots.fake.faults import InjectedFaults
 from egovcp_deploy.robots.wire import encode_command
 from egovcp_deploy.robots.zmq_camera import decode_frame
 from tests.support.robots.fake_g1 import FakeG1Thread, eventually
@@ -50,8 +50,8 @@ class LockstepDriver:
                 episodes.step, lambda last=seen: episodes.finished or self.robot.read() is not last
             )
         target = self.controller.step(self._state()[None])[0]
-        c, received = self.controller, len(self.received)
-        command = MotorCommand(target, c.stiffness, c.damping, MODE)
+        received = len(self.received)
+        command = MotorCommand(target, STIFFNESS, DAMPING, MODE)
         self._send_until(lambda: self.robot.write(command), lambda: self._received(received))
 
     def _send_until(self, send: Callable[[], object], arrived: Callable[[], bool]) -> None:

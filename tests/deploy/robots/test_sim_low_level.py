@@ -6,6 +6,7 @@ import numpy as np
 
 from egovcp.rate import FixedRate
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX
@@ -35,7 +36,7 @@ def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
         state = robot.read()
         assert state.time_ns == clock.now_ns() == robot.time_ns
         target = controller.step(proprioception(state, NEUTRAL)[None])[0]
-        robot.write(MotorCommand(target, controller.stiffness, controller.damping, mode=state.mode))
+        robot.write(MotorCommand(target, STIFFNESS, DAMPING, mode=state.mode))
         picture = robot.camera.read()
         age = clock.now_ns() - picture.time_ns
         assert 0 <= age <= (25_000_000 if clock.now_ns() > 200_000_000 else 200_000_000)

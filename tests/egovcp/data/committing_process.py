@@ -8,7 +8,7 @@ from pathlib import Path
 
 from egovcp.data import Provenance
 from egovcp.data.committer import open_committer
-from egovcp.data.staging import StagedEpisode, encode
+from egovcp.data.staging import encode
 from egovcp.testing import random_episode
 
 
@@ -17,7 +17,7 @@ def main(root: Path) -> None:
     with open_committer(root, Provenance("stance-1"), 3, lambda provenance: None) as committer:
         for number in committer.missing(100_000):
             episode = random_episode(number, length=4)
-            committer.staging.put(StagedEpisode.of(number, encode(episode)))
+            committer.staging.put(number, encode(episode))
             committer.mark_staged(number)
             sealed.add(number)
             print("sealed", number, flush=True)

@@ -23,7 +23,7 @@ from egovcp.data import (
 )
 from egovcp.data.committer import Committer, open_committer, work_folder
 from egovcp.data.metadata import verify_hashes
-from egovcp.data.staging import StagedEpisode, encode
+from egovcp.data.staging import encode
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 _RUN = Provenance("stance-1", seed=0, command="collect", versions={"a": "1"}, config={"task": "x"})
@@ -38,7 +38,7 @@ def _agree(provenance: Provenance) -> None:
 
 def _seal(committer: Committer, episodes: Sequence[Episode], numbers: Sequence[int]) -> None:
     for number in numbers:
-        committer.staging.put(StagedEpisode.of(number, encode(episodes[number])))
+        committer.staging.put(number, encode(episodes[number]))
         committer.mark_staged(number)
 
 

@@ -20,7 +20,7 @@ from egovcp.data import (
     dataset_files,
 )
 from egovcp.data.committer import open_committer, work_folder
-from egovcp.data.staging import StagedEpisode, encode
+from egovcp.data.staging import encode
 from egovcp.errors import EnvironmentFailure, UsageError
 from tests.support.limited import run_limited
 
@@ -37,7 +37,7 @@ def _collect(root: Path, episodes: list[Episode], resume: bool = False) -> None:
     """Add those episodes that the dataset does not have yet."""
     with open_committer(root, _RUN, 2, (lambda provenance: None) if resume else None) as committer:
         for number in committer.missing(len(episodes)):
-            committer.staging.put(StagedEpisode.of(number, encode(episodes[number])))
+            committer.staging.put(number, encode(episodes[number]))
             committer.mark_staged(number)
         committer.commit()
 

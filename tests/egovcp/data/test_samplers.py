@@ -21,6 +21,7 @@ from egovcp.data import (
     ShuffleConfig,
     StreamingSampler,
 )
+from egovcp.data import index as index_module
 from egovcp.data.index import in_split
 from egovcp.data.privileged import privileged_features
 from egovcp.data.samplers import PrefetchIterator
@@ -101,12 +102,13 @@ def test_resuming_continues_with_exactly_the_next_batches(store: EpisodeStore) -
 
 
 def test_resuming_with_other_data_or_settings_is_refused(
-    store: EpisodeStore, reader: DatasetReader
+    store: EpisodeStore, reader: DatasetReader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(index_module, "HELDOUT_FRACTION", 0.5)
     state = InMemorySampler(store, _config()).state_dict()
     with pytest.raises(UsageError, match="length 6 -> 7"):
         InMemorySampler(store, _config(length=7)).load_state_dict(state)
-    fewer = EpisodeStore.load([reader], "train", heldout_fraction=0.5)
+    fewer = EpisodeStore.load([reader], "train")
     with pytest.raises(DataError, match="episodes have changed"):
         InMemorySampler(fewer, _config()).load_state_dict(state)
 
@@ -133,10 +135,11 @@ def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
     np.testing.assert_array_equal(a["mc_return"], b["mc_return"])
 
 
-def test_the_splits_partition_the_episodes(reader: DatasetReader) -> None:
-    train, heldout = (
-        EpisodeStore.load([reader], split, heldout_fraction=0.5) for split in ("train", "heldout")
-    )
+def test_the_splits_partition_the_episodes(
+    reader: DatasetReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(index_module, "HELDOUT_FRACTION", 0.5)
+    train, heldout = (EpisodeStore.load([reader], split) for split in ("train", "heldout"))
     everything = EpisodeStore.load([reader], "all")
     assert not set(train.identities) & set(heldout.identities)
     assert set(train.identities) | set(heldout.identities) == set(everything.identities)

@@ -3,7 +3,7 @@
 import json
 import tracemalloc
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from egovcp.data import (
     ShuffleConfig,
     StreamingSampler,
 )
+from egovcp.data import index as index_module
 from egovcp.errors import DataError, UsageError
 
 from .conftest import MakeEpisode
@@ -32,6 +33,13 @@ RETURNS = ReturnConfig(steps=5)
 FEW = ShuffleConfig(episodes=3)
 
 type MakeIndex = Callable[..., EpisodeIndex]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _more_held_out_episodes() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(index_module, "HELDOUT_FRACTION", 0.2)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +54,7 @@ def make_index(make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFacto
                 for i in range(count):
                     writer.add(make_episode(i, 9 + i % 6, task=task, seed=number))
             readers.append(DatasetReader.open(DatasetConfig(root=str(root))))
-        return EpisodeIndex.of(readers, split, heldout_fraction=0.2)
+        return EpisodeIndex.of(readers, split)
 
     return build
 
@@ -158,7 +166,7 @@ def test_held_out_episodes_are_never_read(
     make_index: MakeIndex, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     index = make_index(20)
-    heldout = set(EpisodeIndex.of(index.readers, "heldout", 0.2).identities)
+    heldout = set(EpisodeIndex.of(index.readers, "heldout").identities)
     assert len(heldout) > 1
     read = set()
     read_unchecked = EpisodeIndex.read_unchecked

@@ -26,6 +26,7 @@ from egovcp.log.picture import (
 )
 from egovcp.log.scene_plot import scene_faces, view_offset
 from egovcp.log.tick import RunInfo
+from egovcp.robot_spec import G1
 from egovcp.spec import Solid
 
 
@@ -33,7 +34,7 @@ def test_key_frames_span_the_events(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=True) for i in range(60)]
     ticks[20] = replace(ticks[20], events=("ball thrown",))
     ticks[38] = replace(ticks[38], events=("blocked",))
-    moments = key_frames(ticks, count=7)
+    moments = key_frames(ticks)
     assert len(moments) == 7
     assert 15 <= moments[0] < 20
     assert 38 < moments[-1] < 50
@@ -61,21 +62,21 @@ def test_imagined_images_are_shown_at_the_tick_they_predict(make_tick: Any) -> N
 def test_missing_data_has_neither_row_nor_curve(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=True) for i in range(AHEAD + 2)]
     last = len(ticks) - 1
-    assert list(depth_rows(ticks, [0, last])) == ["depth seen"]
+    assert list(depth_rows(ticks, [0, last], G1)) == ["depth seen"]
     assert list(curves(ticks)) == ["return so far"]
     ticks[-1] = replace(ticks[-1], depth_reconstructed=np.ones((48, 64)), value=0.5)
-    assert list(depth_rows(ticks, [0, last])) == ["depth seen", "reconstructed"]
-    assert list(depth_rows(ticks, [0])) == ["depth seen"]
+    assert list(depth_rows(ticks, [0, last], G1)) == ["depth seen", "reconstructed"]
+    assert list(depth_rows(ticks, [0], G1)) == ["depth seen"]
     assert list(curves(ticks)) == ["value of the plan", "return so far"]
     ticks[last - AHEAD] = replace(ticks[last - AHEAD], depth_imagined=np.ones((AHEAD, 48, 64)))
-    assert len(depth_rows(ticks, [0, last])) == 3
+    assert len(depth_rows(ticks, [0, last], G1)) == 3
 
 
 def test_fewer_rows_make_a_lower_picture(tmp_path: Path, make_tick: Any) -> None:
     sizes = []
     for bare in (False, True):
         path = tmp_path / f"{bare}.png"
-        rollout_picture([make_tick(i, bare=bare) for i in range(2)], path)
+        rollout_picture([make_tick(i, bare=bare) for i in range(2)], path, "", G1)
         with Image.open(path) as image:
             sizes.append(image.size)
     assert sizes[0][0] == sizes[1][0]
@@ -126,7 +127,7 @@ def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
 
 def test_frames_change_with_the_depth_image(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=False) for i in range(2 * STRIDE)]
-    first, second = video_frames(ticks)
+    first, second = video_frames(ticks, G1)
     assert first.shape == (SIZE[1], SIZE[0], 3)
     assert (first != second).any()
     assert len(np.unique(first)) > 20

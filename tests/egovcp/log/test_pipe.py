@@ -9,7 +9,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from egovcp.log.pipe import Outbox, enlarge, pack, receive
+from egovcp.log.writer_process import Outbox, enlarge, pack, receive
 
 
 @pytest.mark.parametrize("large", [False, True])
@@ -36,7 +36,7 @@ def test_messages_arrive_complete_and_in_order(large: bool) -> None:
 def test_a_truncated_message_is_dropped() -> None:
     reader, writer = os.pipe()
     whole = pack("whole")
-    os.write(writer, len(whole).to_bytes(4, "big") + whole + b"\x00\x00\x00\x20half")
+    os.write(writer, whole + b"\x00\x00\x00\x20half")
     os.close(writer)
     with Connection(reader, writable=False) as connection:
         assert list(receive(connection)) == ["whole"]

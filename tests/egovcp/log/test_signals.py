@@ -7,8 +7,11 @@ from typing import Any
 import numpy as np
 
 from egovcp.log import paths
-from egovcp.log.signals import SIGNALS, limb
+from egovcp.log.signals import limb, signals_of
+from egovcp.robot_spec import G1
 from egovcp.spec import ACTION_BOX, JOINT_NAMES, STATE_DIM
+
+SIGNALS = tuple(signals_of(G1))
 
 
 def test_every_joint_belongs_to_a_limb() -> None:

@@ -28,7 +28,7 @@ def _model(**loss: object) -> WorldModel:
 
 
 def _losses(model: WorldModel, batch: Batch) -> dict[str, Tensor]:
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     return autoregressive_losses(
         model, rollout, batch, pixel_weights(rollout.near, batch, model), 0
     )
@@ -54,7 +54,7 @@ def test_the_networks_are_those_of_the_joint_model() -> None:
 def test_it_is_the_error_of_what_the_planner_imagines() -> None:
     """Tick by tick through `WorldModel.imagine`, each prediction from the one before it."""
     model, batch = _model(), random_batch(2, 6)
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     weight = pixel_weights(rollout.near, batch, model)
     states, pictures = [], []
     for start in range(5):
@@ -123,7 +123,7 @@ def test_imagination_is_learned_without_any_kl() -> None:
         optimizer.step()
     fresh = memory_batch(128, 4, seed=1)
     with torch.no_grad():
-        carry = filter_sequence(model, fresh, sample=False).carry
+        carry = filter_sequence(model, fresh).carry
         state = Carry(carry.h[:, 0], carry.z[:, 0])
         for k in range(3):
             state = model.imagine(state, fresh.action[:, k])

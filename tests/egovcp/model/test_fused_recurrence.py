@@ -7,7 +7,7 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.checks import check_world_model
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
-from egovcp.model.losses import filter_sequence
+from egovcp.model.losses import filter_sequence, latent_noise
 from egovcp.testing import random_batch, toy_model
 from tests.support.models import CountingModel
 
@@ -47,7 +47,7 @@ def test_a_model_of_each_preset_conforms(preset: str) -> None:
 def test_filtering_step_by_step_equals_the_whole_sequence(model: WorldModel, batch: Batch) -> None:
     batch = _restart(batch, 4)
     with torch.no_grad():
-        whole = filter_sequence(model, batch, sample=False)
+        whole = filter_sequence(model, batch)
         _close(whole.carry, _step_by_step(model, batch))
     torch.testing.assert_close(whole.carry.z, whole.posterior.mean)
 
@@ -55,24 +55,11 @@ def test_filtering_step_by_step_equals_the_whole_sequence(model: WorldModel, bat
 def test_sampled_filtering_repeats_by_seed(model: WorldModel, batch: Batch) -> None:
     def run(seed: int) -> Tensor:
         generator = torch.Generator().manual_seed(seed)
-        return filter_sequence(model, batch, generator=generator).carry.z
+        return filter_sequence(model, batch, latent_noise(model, batch, generator)).carry.z
 
     with torch.no_grad():
         assert torch.equal(run(1), run(1))
         assert not torch.equal(run(1), run(2))
-
-
-def test_a_sequence_continues_from_the_carry_of_its_first_half(
-    model: WorldModel, batch: Batch
-) -> None:
-    first, second = (Batch(*(x[:, part] for x in batch)) for part in (slice(0, 3), slice(3, None)))
-    with torch.no_grad():
-        whole = filter_sequence(model, batch, sample=False).carry
-        head = filter_sequence(model, first, sample=False).carry
-        tail = filter_sequence(
-            model, second, Carry(head.h[:, -1], head.z[:, -1]), sample=False
-        ).carry
-    _close(Carry(whole.h[:, 3:], whole.z[:, 3:]), tail)
 
 
 def test_is_first_inside_a_window_forgets_everything_before(
@@ -85,7 +72,7 @@ def test_is_first_inside_a_window_forgets_everything_before(
     )
     changed.prev_action[:, 3] = 1.0  # a_{t-1} belongs to the episode before
     with torch.no_grad():
-        one, two = (filter_sequence(model, b, sample=False).carry for b in (batch, changed))
+        one, two = (filter_sequence(model, b).carry for b in (batch, changed))
     assert not torch.equal(one.h[:, :3], two.h[:, :3])
     _close(Carry(one.h[:, 3:], one.z[:, 3:]), Carry(two.h[:, 3:], two.z[:, 3:]))
 
@@ -94,8 +81,8 @@ def test_is_first_of_one_row_leaves_the_others(model: WorldModel, batch: Batch) 
     first = batch.is_first.clone()
     first[1, 4] = True
     with torch.no_grad():
-        plain = filter_sequence(model, batch, sample=False).carry
-        reset = filter_sequence(model, batch._replace(is_first=first), sample=False).carry
+        plain = filter_sequence(model, batch).carry
+        reset = filter_sequence(model, batch._replace(is_first=first)).carry
     changed = (plain.h != reset.h).any(-1)
     assert changed[1, 4]
     assert not changed[[0, 2]].any()
@@ -107,7 +94,7 @@ def test_no_gradient_crosses_is_first(model: WorldModel) -> None:
     state = batch.state.clone().requires_grad_()
     action = batch.prev_action.clone().requires_grad_()
     batch = batch._replace(state=state, prev_action=action)
-    carry = filter_sequence(model, batch, sample=False).carry
+    carry = filter_sequence(model, batch).carry
     (gradient, of_action) = torch.autograd.grad(carry.features[:, 4:].sum(), (state, action))
     assert gradient[:, 4].abs().max() > 0
     assert gradient[:, :4].abs().max() == 0
@@ -118,7 +105,7 @@ def test_no_gradient_crosses_is_first(model: WorldModel) -> None:
 def test_an_early_observation_reaches_a_late_state(model: WorldModel) -> None:
     batch = random_batch(2, 12)
     state = batch.state.clone().requires_grad_()
-    carry = filter_sequence(model, batch._replace(state=state), sample=False).carry
+    carry = filter_sequence(model, batch._replace(state=state)).carry
     (gradient,) = torch.autograd.grad(carry.h[:, -1].sum(), state)
     assert gradient[:, 0].abs().max() > 0
 
@@ -156,9 +143,9 @@ def test_one_state_broadcasts_over_many_actions(model: WorldModel) -> None:
 
 def test_each_row_is_filtered_as_if_it_were_alone(model: WorldModel, batch: Batch) -> None:
     with torch.no_grad():
-        together = filter_sequence(model, batch, sample=False).carry
+        together = filter_sequence(model, batch).carry
         for b in range(len(batch.valid)):
-            alone = filter_sequence(model, Batch(*(x[b : b + 1] for x in batch)), sample=False)
+            alone = filter_sequence(model, Batch(*(x[b : b + 1] for x in batch)))
             _close(together.map(lambda x, b=b: x[b : b + 1]), alone.carry)  # type: ignore[misc]
 
 

@@ -23,7 +23,7 @@ from egovcp.model import (
     world_model_loss,
 )
 from egovcp.model.config import LossConfig
-from egovcp.model.parallel import run_parallel
+from egovcp.model.objective import run_parallel
 from egovcp.testing import random_batch, toy_model
 from tests.support.models import CountingModel
 

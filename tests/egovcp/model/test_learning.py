@@ -47,7 +47,7 @@ def remembering() -> WorldModel:
 def test_value_knows_what_only_memory_can_tell(remembering: WorldModel) -> None:
     fresh = _task(128, seed=1, forget=False)
     with torch.no_grad():
-        carry = filter_sequence(remembering, fresh, sample=False).carry
+        carry = filter_sequence(remembering, fresh).carry
         values = remembering.value(carry, fresh.action)
     assert _r2(values[:, 1:], fresh.mc_return[:, 1:]) > 0.9
 
@@ -57,7 +57,7 @@ def test_without_memory_the_same_model_cannot_know() -> None:
     """The control: were this to succeed, the test above would prove nothing."""
     model, fresh = _train(forget=True), _task(128, seed=1, forget=True)
     with torch.no_grad():
-        carry = filter_sequence(model, fresh, sample=False).carry
+        carry = filter_sequence(model, fresh).carry
         values = model.value(carry, fresh.action)
     assert _r2(values[:, 1:], fresh.mc_return[:, 1:]) < 0.4
 
@@ -65,7 +65,7 @@ def test_without_memory_the_same_model_cannot_know() -> None:
 def test_value_holds_on_imagined_states(remembering: WorldModel) -> None:
     fresh = _task(128, seed=1, forget=False)
     with torch.no_grad():
-        whole = filter_sequence(remembering, fresh, sample=False).carry
+        whole = filter_sequence(remembering, fresh).carry
         state = Carry(whole.h[:, 0], whole.z[:, 0])
         for k in range(LENGTH - 1):
             state = remembering.imagine(state, fresh.action[:, k])
@@ -76,7 +76,7 @@ def test_value_holds_on_imagined_states(remembering: WorldModel) -> None:
 def test_the_image_survives_in_the_state(remembering: WorldModel) -> None:
     fresh = _task(32, seed=1, forget=False)
     with torch.no_grad():
-        carry = filter_sequence(remembering, fresh, sample=False).carry
+        carry = filter_sequence(remembering, fresh).carry
         first = Carry(carry.h[:, 0], carry.z[:, 0])
         near = remembering.decode_depth(first.features)
     halves = torch.stack([near[..., :32].mean((1, 2)), near[..., 32:].mean((1, 2))], 1)

@@ -73,7 +73,7 @@ def test_without_gradients_images_are_encoded_in_pieces(
     model: WorldModel, batch: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with torch.no_grad():
-        at_once = filter_sequence(model, batch, sample=False)
+        at_once = filter_sequence(model, batch)
         seen: list[int] = []
         monkeypatch.setattr("egovcp.model.losses._CHUNK", 5)
         monkeypatch.setattr(
@@ -81,7 +81,7 @@ def test_without_gradients_images_are_encoded_in_pieces(
             "embed_near",
             lambda *x: seen.append(len(x[0])) or WorldModel.embed_near(model, *x),
         )
-        in_pieces = filter_sequence(model, batch, sample=False)
+        in_pieces = filter_sequence(model, batch)
     assert seen == [5, 5, 5, 5, 1]
     for one, other in zip(at_once.carry, in_pieces.carry, strict=True):
         torch.testing.assert_close(one, other)
@@ -223,7 +223,7 @@ def test_learning_a_fall_raises_termination_after_it_and_nowhere_else() -> None:
     head = list(model.termination_head.parameters())
     optimizer = torch.optim.Adam(head, lr=0.03)
     with torch.no_grad():
-        rollout = filter_sequence(model, batch, sample=False)
+        rollout = filter_sequence(model, batch)
     for _ in range(80):
         losses = value_and_termination_losses(model, rollout, batch, LossConfig())
         optimizer.zero_grad()

@@ -18,14 +18,14 @@ def _model(**loss: object) -> WorldModel:
 
 
 def _losses(model: WorldModel, batch: Batch) -> dict[str, torch.Tensor]:
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     weight = pixel_weights(rollout.near, batch, model)
     return multistep_losses(model, rollout, batch, weight, first=0)
 
 
 def test_it_is_the_error_of_the_state_imagined_so_far_ahead() -> None:
     model, batch = _model(multistep_horizons=(3,)), random_batch(2, 6)
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     errors = []
     for start in range(3):
         carry = type(rollout.carry)(rollout.carry.h[:, start], rollout.carry.z[:, start])

@@ -21,7 +21,7 @@ def _model(**loss: float) -> WorldModel:
 def test_the_loss_is_the_squared_error_of_known_valid_rows() -> None:
     model, batch = toy_model(), random_batch(3, 6)
     batch.valid[1, 4:] = False
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     counted = batch.valid & batch.object_known
     error = model.standardised_object(rollout.carry) - model.standardise_object(batch.object)
     torch.testing.assert_close(
@@ -31,7 +31,7 @@ def test_the_loss_is_the_squared_error_of_known_valid_rows() -> None:
 
 def test_states_imagined_ahead_are_compared_with_the_object_at_their_row() -> None:
     model, batch = _model(multistep_stride=1, multistep_horizons=(3,)), random_batch(2, 6)
-    rollout = filter_sequence(model, batch, sample=False)
+    rollout = filter_sequence(model, batch)
     errors = []
     for start in range(3):
         carry = type(rollout.carry)(rollout.carry.h[:, start], rollout.carry.z[:, start])
@@ -86,12 +86,12 @@ def test_position_and_velocity_are_learned_from_the_states() -> None:
     batch.object[:] = 0.3 * batch.state[..., :6]
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
     for _ in range(150):
-        loss = object_loss(model, filter_sequence(model, batch, sample=False), batch)
+        loss = object_loss(model, filter_sequence(model, batch), batch)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     with torch.no_grad():
-        carry = filter_sequence(model, batch, sample=False).carry
+        carry = filter_sequence(model, batch).carry
         truth = model.standardise_object(batch.object)
         error = (model.standardised_object(carry) - truth)[batch.object_known]
         distance = model.object_position(carry) - batch.object[..., :3]

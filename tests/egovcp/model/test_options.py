@@ -77,7 +77,7 @@ def test_options_of_the_heads_do_not_change_the_other_initial_weights(name: str)
 def _asked(model: WorldModel) -> tuple[Carry, torch.Tensor]:
     batch = random_batch(3, 4)
     with torch.no_grad():
-        return filter_sequence(model, batch, sample=False).carry, batch.action
+        return filter_sequence(model, batch).carry, batch.action
 
 
 @pytest.mark.parametrize("kind", ["mse", "two_hot"])
@@ -99,7 +99,7 @@ def test_a_model_without_a_reward_head_says_how_to_get_one() -> None:
 
 def _reward_loss(model: WorldModel, batch: Batch) -> torch.Tensor:
     with torch.no_grad():
-        rollout = filter_sequence(model, batch, sample=False)
+        rollout = filter_sequence(model, batch)
     losses = value_and_termination_losses(model, rollout, batch, model.config.loss)
     return losses["reward"]
 
@@ -119,7 +119,7 @@ def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
         _reward_loss(model, batch).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
     with torch.no_grad():
-        carry = filter_sequence(model, batch, sample=False).carry
+        carry = filter_sequence(model, batch).carry
         ahead = model.imagine(carry, batch.action)
         for state in (carry, ahead):
             error = model.reward(state, batch.action) - batch.reward

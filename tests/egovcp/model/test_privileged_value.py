@@ -117,7 +117,7 @@ def test_q_learns_how_the_value_depends_on_actions_that_were_not_taken() -> None
         world_model_gradients(model, batch, draws, value)
         optimizer.step()
     with torch.no_grad():
-        carry = filter_sequence(model, batch, sample=False).carry
+        carry = filter_sequence(model, batch).carry
         action = batch.action.clone()
         low, high = (
             model.value(carry, torch.cat([action[..., :1] + x, action[..., 1:]], -1))

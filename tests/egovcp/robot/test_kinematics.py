@@ -77,7 +77,7 @@ def test_arm_kinematics_agree_with_the_whole_body() -> None:
     state = np.zeros((6, STATE_DIM))
     state[:, 5] = -1.0
     state[:, STATE_SLICES["joint_position"]] = joints
-    torso = kinematics.link_transforms(joints)[0][:, kinematics.TORSO_LINK]
+    torso = kinematics.link_transforms(joints)[0][:, kinematics.LINK_NAMES.index("torso_link")]
     palms = arms.forward(joints[:, ARMS].reshape(-1, 2, 7)).palm + torso[:, None]
     np.testing.assert_allclose(palms, kinematics.palm_positions(state), atol=1e-12)
 

@@ -50,7 +50,6 @@ def test_error_names_scenario_and_what_diverged(
         env.step(NO_ACTION)
     assert "task ball, seed 7, episode 1, after 0.0" in str(caught.value)
     assert "radius=0." in str(caught.value)
-    assert caught.value.episode == 1
     assert caught.value.exit_code == 3
     assert list(tmp_path.iterdir()) == []  # MuJoCo writes no MUJOCO_LOG.TXT
 

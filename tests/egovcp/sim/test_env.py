@@ -144,7 +144,7 @@ class Recorder:
 
     def __init__(self, inner: VectorEnv) -> None:
         self._inner = inner.controller
-        self.id, self.walks, self.stiffness, self.damping = "recorder", True, None, None
+        self.id, self.walks = "recorder", True
         self.heights: list[float] = []
 
     def reset(self, state: np.ndarray, rows: np.ndarray | None = None) -> None:

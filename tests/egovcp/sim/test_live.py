@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.geometry import rotate, rotation_matrix
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
@@ -45,8 +46,7 @@ class Loop:
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * 50)):
             target = self.controller.step(self.state(self.live.measure())[None])[0]
-            c = self.controller
-            self.live.drive(ServoCommand(target, c.stiffness, c.damping))
+            self.live.drive(ServoCommand(target, STIFFNESS, DAMPING))
             self.live.advance(4)
 
 
@@ -66,7 +66,7 @@ def test_it_is_the_episode_of_the_environment(
 
     def follow(state: NDArray[np.floating]) -> NDArray[np.float64]:
         target = step(state)
-        live.drive(ServoCommand(target[0], env.controller.stiffness, env.controller.damping))
+        live.drive(ServoCommand(target[0], STIFFNESS, DAMPING))
         live.advance(4)
         return target
 

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 
 TIMEOUT_S = 120.0
 

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from typing import Final
 
@@ -31,14 +31,15 @@ from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.live.control_process import RECEIVER_PRIORITY, control_process
-from egovcp_deploy.live.hardware import CameraOptions, ControlSetup
+from egovcp_deploy.live.hardware import CameraOptions, RobotOptions
 from egovcp_deploy.live.link import Link, decode_observation, encode_operator_command, encode_plan
 from egovcp_deploy.live.processes import DampingWatchdog, standby_body
 from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.command import StepPacer
+from egovcp_deploy.robots.fake.faults import InjectedFaults
 from egovcp_deploy.robots.wire import MalformedMessage, decode_command
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 
@@ -124,8 +125,8 @@ def constant_plan(report: ObservationMessage) -> list[list[bytes]]:
     return [encode_plan(constant_reply(report))]
 
 
-def _run_control_process(setup: ControlSetup) -> None:
-    control_process(replace(setup, parent=os.getppid()))  # the fork server
+def _run_control_process(options: RobotOptions, address: str) -> None:
+    control_process(options, address, os.getppid())  # the fork server
 
 
 class FaultRig:
@@ -245,15 +246,16 @@ class FaultRig:
         stack.callback(link.close)
         self._outbox.clear()
         spare = stack.enter_context(standby_body(bridge))
-        setup = ControlSetup(bridge, camera, "stance", LIMITS, address, os.getpid())
+        options = RobotOptions(controller="stance", bridge=bridge, camera=camera, limits=LIMITS)
         self._mode, self._ending = "", False
         self.process: BaseProcess = _FORKSERVER.Process(
-            target=_run_control_process, args=(setup,), daemon=True
+            target=_run_control_process, args=(options, address), daemon=True
         )
         with raised_priority(RECEIVER_PRIORITY):  # inherited by the fork server
             self.process.start()
         stack.callback(self._end_process)
-        guard = DampingWatchdog(self.process, spare, lambda: self._ending)
+        guard = DampingWatchdog(self.process, spare)
+        guard.expected = lambda: self._ending
         stack.callback(guard.join_if_ended)
         ending = threading.Event()
         planner = threading.Thread(target=self._plan, args=(link, ending), daemon=True)

@@ -70,6 +70,8 @@ class Alarms:
 class _CheckedRobot:
     """As `BridgeRobot`, of a `LiveRobot`, with 200 checked readings a second."""
 
+    refusal = fault = rejected = ""
+
     def __init__(self, robot: LiveRobot, clock: LockstepClock, alarms: Alarms) -> None:
         self._clock, self._alarms = clock, alarms
         self._sim = SimLowLevelRobot(robot, MODE)

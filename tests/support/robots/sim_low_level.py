@@ -46,6 +46,8 @@ class SimLowLevelRobot:
         mode: the mode machine that it reports.
     """
 
+    refusal = fault = rejected = ""
+
     def __init__(self, robot: LiveRobot, mode: int = 0) -> None:
         self.robot = robot
         self.pressed: frozenset[str] = frozenset()
@@ -99,7 +101,7 @@ class SimLowLevelRobot:
 
 
 class SimDepthCamera:
-    """`DepthCamera` of a `SimLowLevelRobot`."""
+    """The depth camera of a `SimLowLevelRobot`."""
 
     def __init__(self, robot: SimLowLevelRobot) -> None:
         self._robot = robot

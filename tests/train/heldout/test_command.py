@@ -116,7 +116,7 @@ def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Pat
     [
         ("--episodes=-1", 2, "--episodes=-1"),
         ("--stride=0", 2, "--stride=0"),
-        ("--policy.path=", 2, "no policy given"),
+        ("--policy.path=", 2, "--policy.path is missing"),
         ("--split=test", 2, "unknown split 'test'"),
         ("--policy.path=/nowhere", 4, "no such folder: '/nowhere'"),
         ("--dataset.root=/nowhere", 3, "/nowhere"),

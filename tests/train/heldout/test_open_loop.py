@@ -73,7 +73,7 @@ def _episodes() -> Batch:
 def _errors(model: WorldModel, episodes: Batch, stride: int = 1) -> OpenLoop:
     found = OpenLoop(stride)
     with torch.no_grad():
-        found.add(model, episodes, filter_sequence(model, episodes, sample=False))
+        found.add(model, episodes, filter_sequence(model, episodes))
     return found
 
 
@@ -161,7 +161,7 @@ def test_groups_add_up() -> None:
     model = _Clairvoyant(episodes, repeats=True)
     once, twice = _errors(model, episodes), _errors(model, episodes)
     with torch.no_grad():
-        twice.add(model, episodes, filter_sequence(model, episodes, sample=False))
+        twice.add(model, episodes, filter_sequence(model, episodes))
     for a, b in zip(_flat(once.depth()), _flat(twice.depth()), strict=True):
         assert b["pixels"] == 2 * a["pixels"]
         assert b["model_mm"] == pytest.approx(a["model_mm"])
@@ -171,7 +171,7 @@ def test_groups_add_up() -> None:
 def _strips(batch: Batch) -> list[Strip]:
     model = toy_model()
     with torch.no_grad():
-        rollout = filter_sequence(model, batch, sample=False)
+        rollout = filter_sequence(model, batch)
         return strips(model, batch, rollout)
 
 
@@ -195,7 +195,7 @@ def test_the_first_picture_is_filtered_and_the_others_are_imagined() -> None:
     batch = random_batch(1, 30)
     model = toy_model()
     with torch.no_grad():
-        rollout = filter_sequence(model, batch, sample=False)
+        rollout = filter_sequence(model, batch)
         (found,) = _strips(batch)
         s = found.start
         carry = Carry(rollout.carry.h[:, s], rollout.carry.z[:, s])

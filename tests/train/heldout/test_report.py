@@ -209,7 +209,7 @@ def _found() -> TerminationRows:
     batch = batch._replace(valid=valid, terminal_next=fails)
     model = _Clock(PRESETS["debug"])
     with torch.no_grad():
-        return termination_rows(model, batch, filter_sequence(model, batch, sample=False))
+        return termination_rows(model, batch, filter_sequence(model, batch))
 
 
 def test_a_row_is_judged_by_the_rows_that_follow_it() -> None:
@@ -341,7 +341,7 @@ def test_the_error_of_the_object_is_its_distance_over_known_rows() -> None:
     model, batch = toy_model(), random_batch(2, 5)
     batch.valid[1, 3:] = False
     with torch.no_grad():
-        found = model.object_position(filter_sequence(model, batch, sample=False).carry)
+        found = model.object_position(filter_sequence(model, batch).carry)
     batch.object[..., :3] = found + torch.tensor([0.3, 0.0, 0.4])
     batch.object[~batch.object_known] = 100.0
     result = measure(model, [EpisodeBatch("ball", batch), EpisodeBatch("wall", batch)])

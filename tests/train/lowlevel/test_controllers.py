@@ -32,7 +32,7 @@ def test_robots_of_randomised_physics_are_still_up_and_walking_after_two_seconds
     physics, sensors = DisturbanceConfig(models=16), SensorConfig()
     outcome = play(WalkingController(no_residual()), skill, 16, seed, physics, sensors, "points")
     assert outcome.survived.mean() > 0.7
-    assert outcome.stepping.min() > 0.6
+    assert outcome.stepping_share.min() > 0.6
 
 
 # --- the shipped controller -----------------------------------------------------------
@@ -70,4 +70,4 @@ def test_on_stock_feet_and_randomised_physics_it_stays_up(name):
     outcome = _short(name, 4.0)
     assert outcome.survived.all()
     if name != "push":
-        assert np.nanmean(outcome.velocity_error) < 0.1
+        assert np.nanmean(outcome.velocity_error_mps) < 0.1

@@ -130,12 +130,12 @@ def _play(script: str, seconds: float, **options: float):
 def test_the_stance_law_stands_and_reaches():
     outcome = _play("held_targets", 2.4, settled_only=True)
     assert outcome.survived.all()
-    assert (outcome.hand_error < 0.03).all()
-    assert (outcome.height_error < 0.02).all()
-    assert np.isnan(outcome.velocity_error).all()
-    assert np.isnan(outcome.turning_error).all()
-    assert outcome.camera.shape == (4, 3)
-    assert (outcome.camera < outcome.camera_8).all()
+    assert (outcome.hand_error_m < 0.03).all()
+    assert (outcome.height_error_m < 0.02).all()
+    assert np.isnan(outcome.velocity_error_mps).all()
+    assert np.isnan(outcome.turning_error_radps).all()
+    assert outcome.camera_px_per_step.shape == (4, 3)
+    assert (outcome.camera_px_per_step < outcome.camera_px_8_steps).all()
 
 
 def test_a_robot_that_is_thrown_down_has_fallen():
@@ -152,7 +152,7 @@ def test_stepping_is_the_share_of_the_ticks_up_to_a_fall_in_which_it_steps():
         ("walk", stand, 0.0, 0.1),
         ("stance", walk, 0.0, 0.0),
     ):
-        share = play(make_controller(name), skill, 4, 0, physics, sensors).stepping
+        share = play(make_controller(name), skill, 4, 0, physics, sensors).stepping_share
         assert ((low <= share) & (share <= high)).all(), (name, share)
 
 

@@ -15,8 +15,8 @@ from egovcp.reactive import ReactiveConfig
 from egovcp.sim.base_env import Observation, StepResult
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
-from egovcp_train.ppo.config import PpoTrainConfig
 from egovcp_train.ppo.learner import ContactEnv, ContactLearner
+from egovcp_train.ppo.train import PpoTrainConfig
 
 LIMIT = 4
 TINY = ReactiveConfig(frames=2, channels=(2, 2, 2), hidden=(16,))

@@ -80,7 +80,8 @@ def evaluate(config: HeldoutConfig) -> None:
         EnvironmentFailure: the folder cannot be written.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
-    output = _check(config)
+    config.policy.require()
+    output = prepare_output(config.output_dir, resume=False, resumable=False)
     torch.set_num_threads(config.threads or available_cores())
     device = choose_device(config.device)
     reader = DatasetReader.open(config.dataset)
@@ -100,7 +101,10 @@ def evaluate(config: HeldoutConfig) -> None:
         if found["episodes"] < requested[task]:
             found |= {"incomplete": True, "episodes_requested": requested[task]}
     echo(table(report.tasks))
-    _write(output, report, _run(config, artifact, reader) | {"complete": complete})
+    run = _run(config, artifact, reader) | {"complete": complete}
+    content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
+    output.mkdir(parents=True, exist_ok=True)
+    write_json(output / RESULT, finite_or_null(content))
     if not complete:
         counts = [f"{task} {played.get(task, 0)} of {n}" for task, n in requested.items()]
         echo(f"INCOMPLETE: {', '.join(counts)} episodes measured")
@@ -109,13 +113,6 @@ def evaluate(config: HeldoutConfig) -> None:
     if config.pictures:
         _show(output, report, model.config.depth_max_m)
     echo(f"metrics: {output / RESULT}")
-
-
-def _check(config: HeldoutConfig) -> Path:
-    """Check the options before any work starts; returns the output folder."""
-    if not config.policy.path:
-        raise UsageError("no policy given: --policy.path=RUN/checkpoints/last/pretrained_model")
-    return prepare_output(config.output_dir, resume=False, resumable=False)
 
 
 def require_same_robot(artifact: Artifact, reader: DatasetReader) -> None:
@@ -153,12 +150,6 @@ def _run(config: HeldoutConfig, artifact: Artifact, reader: DatasetReader) -> di
         "stride": config.stride,
         "command": [PROG, *sys.argv[1:]],
     }
-
-
-def _write(output: Path, report: HeldoutReport, run: dict[str, Any]) -> None:
-    output.mkdir(parents=True, exist_ok=True)
-    content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
-    write_json(output / RESULT, finite_or_null(content))
 
 
 def _show(output: Path, report: HeldoutReport, depth_max_m: float) -> None:

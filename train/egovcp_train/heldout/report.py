@@ -47,8 +47,6 @@ def episode_batches(
     """The episodes of a store, task by task.
 
     Args:
-        store: the episodes.
-        device: of the tensors.
         per_task: at most this many episodes of each task, evenly spread; None: all.
     """
     for task in sorted(set(store.tasks)):
@@ -92,14 +90,9 @@ def calibration(value: Tensor, target: Tensor) -> dict[str, float | int | None]:
 
 
 def ranking(value: Tensor, target: Tensor) -> float | None:
-    """Correlation of the advantages of K actions over their mean, by Q and by its target.
+    """Correlation of the advantages of K actions over their mean, by Q and by its target (n, K).
 
-    Args:
-        value: Q (n, K).
-        target: the same by the target of Q.
-
-    Returns:
-        None if either does not depend on the action.
+    None if either does not depend on the action.
     """
     a, b = (x.double() - x.double().mean(1, keepdim=True) for x in (value, target))
     scale = float((a.square().mean() * b.square().mean()).sqrt())
@@ -149,14 +142,9 @@ def termination_scores(
 
 
 def auc(score: Tensor, positive: Tensor) -> float | None:
-    """Area under the ROC curve from the ranks (Mann and Whitney), ties counting half.
+    """Area under the ROC curve of (n,) from the ranks (Mann and Whitney), ties counting half.
 
-    Args:
-        score: (n,).
-        positive: (n,) bool.
-
-    Returns:
-        None without positives or without negatives.
+    None without positives or without negatives.
     """
     positives = int(positive.sum())
     negatives = positive.numel() - positives
@@ -219,7 +207,7 @@ class TaskMeasurements:
 
     def add(self, model: WorldModel, batch: Batch, open_loop: bool) -> None:
         """Filter a batch of episodes as on the robot, and measure it."""
-        rollout = filter_sequence(model, batch, sample=False)
+        rollout = filter_sequence(model, batch)
         self.episodes += len(batch.valid)
         self.rows += int(batch.valid.sum())
         if open_loop:
@@ -291,8 +279,6 @@ def measure(
     """Measure a model.
 
     Args:
-        model: the model.
-        episodes: batches of episodes.
         stride: rows between the starts of open-loop predictions.
         stopped: once it returns true, the remaining episodes are left out.
         critic: the target of Q; None: the return of the data's actions.

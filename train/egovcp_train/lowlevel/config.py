@@ -128,8 +128,6 @@ class NetworkConfig:
     """Hidden layers of the policy."""
     critic: tuple[int, ...] = bounded((256, 128, 64), least=1, most=8192, longest=16)
     """Hidden layers of the critic, which also reads the true state of the simulation."""
-    activation: str = "elu"
-    """Activation of both."""
     initial_std: float = bounded(0.3, above=0)
     """Initial standard deviation of the policy's actions."""
 

@@ -80,16 +80,13 @@ class TaskLogic:
         self._velocity.add(x)
         self._torso.add(x)
         self._since_push = np.minimum(self._since_push + 1, _RECOVERY_TICKS)
-        walk, gait = self.walk, self.walk.gait
+        walk = self.walk
         self.fallen = rewards.fallen(x, walk.height, walk.pitch)
         return rewards.terms(
             x,
             self._velocity.value,
             self.commands.vector,
-            walk.height,
-            walk.pitch,
-            gait.phase,
-            gait.amount,
+            walk,
             self._action,
             self._last_action,
             self._torso,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.bounds import MAX_PER_CORE, bounded
@@ -31,18 +30,6 @@ from egovcp_train.lowlevel.skills import SKILLS, Skill
 PROG = "egovcp-eval-lowlevel"
 RESULT = "lowlevel.json"
 _BATCH: Final = 200  # robots side by side
-_FIGURES: Final = {
-    "hand_error_m": "hand_error",
-    "hand_lag_s": "hand_lag",
-    "height_error_m": "height_error",
-    "velocity_error_mps": "velocity_error",
-    "turning_error_radps": "turning_error",
-    "head_top_m": "head_top",
-    "stepping_share": "stepping",
-}
-
-
-_CAMERA: Final = {"camera_px_per_step": "camera", "camera_px_8_steps": "camera_8"}
 
 
 @dataclass(frozen=True)
@@ -139,13 +126,14 @@ def _play_all(
     Raises:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
+    from egovcp_train.lowlevel.trial import SkillRecorder, play  # MuJoCo; --help needs none
+
     recorders: dict[str, Any] = {}
     if config.videos:
-        from egovcp_train.lowlevel.trial import SkillRecorder  # MuJoCo
-
         folder = Path(config.output_dir)
         folder.mkdir(parents=True, exist_ok=True)
         recorders = {skill.name: SkillRecorder(skill.name, folder) for skill in skills}
+    threads = config.threads or available_cores()
     total = len(skills) * config.episodes
     with (
         stop_on_signal() as received,
@@ -154,11 +142,26 @@ def _play_all(
         for skill in skills:
             bar.set_postfix_str(skill.name)
             parts: list[Any] = []
-            try:
-                _play(config, skill, bar, parts, lambda: bool(received), recorders.get(skill.name))
-            finally:
-                if parts:
-                    figures[skill.name] = _figures(skill, parts, config.episodes)
+            for first in range(0, config.episodes, _BATCH):
+                robots = min(_BATCH, config.episodes - first)
+                recorder = None if first else recorders.get(skill.name)
+                outcome = play(
+                    make_controller(config.controller),
+                    skill,
+                    robots,
+                    config.seed + first,
+                    config.disturbances,
+                    config.sensors,
+                    config.feet,
+                    threads,
+                    lambda: bool(received),
+                    on_tick=recorder.add if recorder else None,
+                )
+                if recorder:
+                    recorder.write()
+                parts.append(outcome)
+                figures[skill.name] = _figures(skill, parts, config.episodes)
+                bar.update(robots)
 
 
 def _chosen(names: str) -> list[Skill]:
@@ -169,47 +172,9 @@ def _chosen(names: str) -> list[Skill]:
     return [by_name[name] for name in names.split(",")]
 
 
-def _play(
-    config: LowLevelEvalConfig,
-    skill: Skill,
-    bar: Any,
-    parts: list[Any],
-    stopped: Callable[[], bool],
-    recorder: Any,
-) -> None:
-    """Play a skill with batches of robots; appends the outcomes to ``parts``."""
-    from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
-
-    threads = config.threads or available_cores()
-    for first in range(0, config.episodes, _BATCH):
-        robots = min(_BATCH, config.episodes - first)
-        parts.append(
-            play(
-                make_controller(config.controller),
-                skill,
-                robots,
-                config.seed + first,
-                config.disturbances,
-                config.sensors,
-                config.feet,
-                threads,
-                stopped,
-                on_tick=recorder.add if recorder and not first else None,
-            )
-        )
-        if recorder and not first:
-            recorder.write()
-        bar.update(robots)
-
-
 def _figures(skill: Skill, parts: Sequence[Any], requested: int) -> dict[str, Any]:
     """One row of the table, from the outcomes of batches."""
-
-    def finite(name: str) -> NDArray[Any]:
-        values = np.concatenate([getattr(part, name) for part in parts])
-        return np.asarray(values[np.isfinite(values).reshape(len(values), -1).all(axis=1)])
-
-    survived = finite("survived")
+    survived = np.concatenate([part.survived for part in parts])
     low, high = wilson(int(survived.sum()), len(survived))
     out: dict[str, Any] = {
         "about": skill.about,
@@ -219,12 +184,12 @@ def _figures(skill: Skill, parts: Sequence[Any], requested: int) -> dict[str, An
     }
     if len(survived) < requested:
         out |= {"incomplete": True, "episodes_requested": requested}
-    for key, name in {**_FIGURES, **_CAMERA}.items():
-        known = finite(name)
-        out[key] = known.mean(axis=0).tolist() if len(known) else None
-    torque = finite("torque_rms")
-    by_joint = zip(JOINT_NAMES, torque.mean(axis=0).tolist(), strict=True) if len(torque) else None
-    out["torque_rms_relative"] = dict(by_joint) if by_joint else None
+    for name in list(vars(parts[0]))[1:]:  # without ``survived``
+        values = np.concatenate([getattr(part, name) for part in parts])
+        known = values[np.isfinite(values).reshape(len(values), -1).all(axis=1)]
+        out[name] = known.mean(axis=0).tolist() if len(known) else None
+    if torque := out["torque_rms_relative"]:
+        out["torque_rms_relative"] = dict(zip(JOINT_NAMES, torque, strict=True))
     return out
 
 

@@ -26,7 +26,7 @@ _LEARNING_RATE: Final = 5e-4
 
 def rsl_rl_config(network: NetworkConfig, ppo: RslRlPpoConfig) -> dict[str, Any]:
     """rsl-rl's configuration of actor, critic and PPO."""
-    shared = {"class_name": "MLPModel", "activation": network.activation, "obs_normalization": True}
+    shared = {"class_name": "MLPModel", "activation": "elu", "obs_normalization": True}
     return on_policy.rsl_rl_config(
         ppo,
         shared | {"hidden_dims": list(network.actor)},

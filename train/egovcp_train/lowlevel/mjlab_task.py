@@ -155,9 +155,9 @@ class SymmetricPpoCfg(RslRlPpoAlgorithmCfg):
     rnd_cfg: dict[str, Any] | None = None
 
 
-def rl_cfg(network: NetworkConfig | None = None, ppo: RslRlPpoConfig | None = None) -> Any:
+def rl_cfg() -> Any:
     """PPO as on the CPU."""
-    shared = rsl_rl_config(network or NetworkConfig(), ppo or RslRlPpoConfig())
+    shared = rsl_rl_config(NetworkConfig(), RslRlPpoConfig())
     algorithm = shared["algorithm"]
     algorithm["symmetry_cfg"]["data_augmentation_func"] = "egovcp_train.lowlevel.env:mirrored"
     return RslRlOnPolicyRunnerCfg(

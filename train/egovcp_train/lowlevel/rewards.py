@@ -11,6 +11,7 @@ from egovcp.robot.arms import DT
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.stance_table import NU
+from egovcp.robot.walking import Walk
 from egovcp_train.lowlevel.physics import Snapshot
 from egovcp_train.lowlevel.sensing import (
     TorsoMotion,
@@ -51,10 +52,7 @@ def terms(
     x: Snapshot,
     motion: Array,
     command: Array,
-    height: Array,
-    pitch: Array,
-    phase: Array,
-    gait: Array,
+    walk: Walk,
     action: Array,
     last_action: Array,
     torso: TorsoMotion,
@@ -66,15 +64,13 @@ def terms(
         x: the true state.
         motion: (N, 3) m/s ahead and across, rad/s of turning, averaged (`AverageVelocity`).
         command: (N, 10) v, hands, height.
-        height: (N,) m, reference of the pelvis.
-        pitch: (N,) rad, the natural pitch at that height.
-        phase: (N,) rad, phase of the gait.
-        gait: (N,) amplitude of the gait, 0 to 1.
+        walk: the controller, for the pelvis' height and natural pitch, and the gait.
         action: (N, 15) of the policy.
         last_action: (N, 15) of the tick before.
         torso: its angular velocity, including this tick.
         pushed: (N,) whether a push was so recent that steps cost nothing.
     """
+    height, pitch, gait = walk.height, walk.pitch, walk.gait.amount
     turn = rotation_matrix(x.quaternion)
     forward = heading(turn)
     up = turn[:, 2]  # the world's vertical in the pelvis frame
@@ -91,7 +87,7 @@ def terms(
         "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / 0.1),
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
         "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
-        "contact": _feet_in_phase(on, phase, gait),
+        "contact": _feet_in_phase(on, walk.gait.phase, gait),
         "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDING_SPEED) * ~pushed,
         "torso_rate": np.minimum(_off_turning(torso.rate, command), _MAX_ROTATION),
         "torso_change": np.minimum(np.sum(torso.change**2, axis=1), _MAX_ROTATION),

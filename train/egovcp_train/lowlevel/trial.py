@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from egovcp.log.tick import RunInfo, Tick
 from egovcp.robot.arms import nearest_reachable
 from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.g1 import EFFORT_LIMIT, WAIST
-from egovcp.robot.geometry import rotation_matrix, rotation_vector
+from egovcp.robot.geometry import heading_rotation, rotation_matrix, rotation_vector
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot_spec import G1
@@ -56,51 +55,42 @@ _LAGS: Final = 25  # ticks, the longest lag looked for
 
 @dataclass(frozen=True)
 class SkillOutcome:
-    """Metrics per robot, (N,); NaN where there was nothing to measure."""
+    """Metrics per robot, (N,); NaN where there was nothing to measure.
+
+    After ``survived``, the names are those in lowlevel.json, which has the means.
+    """
 
     survived: NDArray[np.bool_]
-    hand_error: Array  # m, mean distance to the nearest reachable target
-    hand_lag: Array  # s, by which the hands follow best
-    height_error: Array  # m, mean
-    velocity_error: Array  # m/s, mean over strides
-    turning_error: Array  # rad/s, mean over strides
-    head_top: Array  # m, highest in walking
-    stepping: Array  # share of the ticks in which the robot steps
-    camera: Array  # (N, 3) px up, across, by roll; mean rotation per planner step
-    camera_8: Array  # (N, 3) px, per 8 planner steps
-    torque_rms: Array  # (N, 29) RMS torque of each joint, relative to the motor's peak
+    hand_error_m: Array  # mean distance to the nearest reachable target
+    hand_lag_s: Array  # by which the hands follow best
+    height_error_m: Array  # mean
+    velocity_error_mps: Array  # mean over strides
+    turning_error_radps: Array  # mean over strides
+    head_top_m: Array  # highest in walking
+    stepping_share: Array  # of the ticks
+    camera_px_per_step: Array  # (N, 3) up, across, by roll; mean rotation per planner step
+    camera_px_8_steps: Array  # (N, 3) per 8 planner steps
+    torque_rms_relative: Array  # (N, 29) RMS torque of each joint, relative to the motor's peak
 
 
-class _Series:
-    """Time series (T, N, ...) of one trial."""
-
-    def __init__(self) -> None:
-        self._found: dict[str, list[NDArray[Any]]] = defaultdict(list)
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        return np.array(self._found[name])
-
-    def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
-        """Add a tick."""
-        turn = rotation_matrix(x.quaternion)
-        forward = heading(turn)
-        to_heading = _heading_from_world(forward)
-        pelvis = to_heading @ turn
-        torso = torso_rotation(pelvis, x.joints[:, WAIST])
-        hands = command[:, 3:9].reshape(-1, 2, 3)
-        planar = to_heading_xy(x.velocity, forward)
-        if len(self._found["height"]) % CONTROLLER_TICKS_PER_PLAN == 0:
-            self._found["torso"].append(np.nan_to_num(sensing.torso(x)))
-        for name, value in {
-            "hands": (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0],
-            "targets": nearest_reachable(hands, pelvis, torso),
-            "height": x.position[:, 2],
-            "velocity": np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1),
-            "head": x.head_top,
-            "stepping": stepping,
-            "torque": x.torque,
-        }.items():
-            self._found[name].append(value.copy())
+def _observe(x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """What is measured in a tick, (N, ...); hands and targets in the heading frame."""
+    turn = rotation_matrix(x.quaternion)
+    forward = heading(turn)
+    pelvis = heading_rotation(-turn[:, 2])
+    palms = x.palms - x.position[:, None]
+    hands = command[:, 3:9].reshape(-1, 2, 3)
+    planar = to_heading_xy(x.velocity, forward)
+    return {
+        "hands": np.concatenate([to_heading_xy(palms, forward), palms[..., 2:]], axis=-1),
+        "targets": nearest_reachable(hands, pelvis, torso_rotation(pelvis, x.joints[:, WAIST])),
+        "height": x.position[:, 2].copy(),
+        "velocity": np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1),
+        "head": x.head_top,
+        "stepping": stepping.copy(),
+        "torso": np.nan_to_num(sensing.torso(x)),
+        "torque": x.torque.copy(),
+    }
 
 
 def play(
@@ -127,7 +117,7 @@ def play(
     rng = np.random.default_rng([seed, 1])
     commands = skill.script(skill.ticks, robots, rng)
     qpos = neutral_qpos(robots)
-    std, series = noise_std(sensors), _Series()
+    std, ticks = noise_std(sensors), list[dict[str, NDArray[Any]]]()
     alive = np.ones((skill.ticks, robots), dtype=bool)
     with closing(BatchPhysics(robots, feet, disturbances, threads, seed, options)) as physics:
         physics.place(np.arange(robots), qpos, qpos[:, 7:])
@@ -144,9 +134,10 @@ def play(
             x = physics.snapshot()
             _require_valid(physics, alive[tick], f"skill {skill.name}, seed {seed}, tick {tick}")
             alive[tick:] &= ~_fallen(x)
-            series.add(x, command, controller.stepping)
+            ticks.append(_observe(x, command, controller.stepping))
             if on_tick:
                 on_tick(x, command)
+    series = {name: np.array([values[name] for values in ticks]) for name in ticks[0]}
     return _measure(skill, commands, series, alive)
 
 
@@ -174,17 +165,11 @@ def _fallen(x: Snapshot) -> NDArray[np.bool_]:
     return out | (x.position[:, 2] < _FALLEN_HEIGHT)
 
 
-def _heading_from_world(forward: Array) -> Array:
-    c, s = forward.T
-    o, i = np.zeros_like(c), np.ones_like(c)
-    rows = [[c, s, o], [-s, c, o], [o, o, i]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def _measure(
-    skill: Skill, commands: Array, series: _Series, alive: NDArray[np.bool_]
+    skill: Skill, commands: Array, series: dict[str, NDArray[Any]], alive: NDArray[np.bool_]
 ) -> SkillOutcome:
     hands, targets, velocity = series["hands"], series["targets"], series["velocity"]
+    torso = series["torso"][::CONTROLLER_TICKS_PER_PLAN]
     moves = commands[..., :3].any()
     reaches = np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
     counted = alive.copy()
@@ -196,20 +181,20 @@ def _measure(
     none = np.full(alive.shape[1], np.nan)
     return SkillOutcome(
         survived=alive[-1],
-        hand_error=_mean(np.linalg.norm(hands - targets, axis=-1).mean(axis=-1), counted),
-        hand_lag=_lag(hands, targets, counted) if reaches else none,
-        height_error=_mean(np.abs(series["height"] - commands[..., -1]), counted),
-        velocity_error=_velocity_error(velocity[..., :2], commands[..., :2], counted)
+        hand_error_m=_mean(np.linalg.norm(hands - targets, axis=-1).mean(axis=-1), counted),
+        hand_lag_s=_lag(hands, targets, counted) if reaches else none,
+        height_error_m=_mean(np.abs(series["height"] - commands[..., -1]), counted),
+        velocity_error_mps=_velocity_error(velocity[..., :2], commands[..., :2], counted)
         if moves
         else none,
-        turning_error=_velocity_error(velocity[..., 2:], commands[..., 2:3], counted)
+        turning_error_radps=_velocity_error(velocity[..., 2:], commands[..., 2:3], counted)
         if moves
         else none,
-        head_top=_highest(series["head"], counted) if moves else none,
-        stepping=_mean(series["stepping"], alive),
-        camera=_rotation(series["torso"], planned, 1),
-        camera_8=_rotation(series["torso"], planned, 8),
-        torque_rms=_torque_rms(series["torque"], alive),
+        head_top_m=_highest(series["head"], counted) if moves else none,
+        stepping_share=_mean(series["stepping"], alive),
+        camera_px_per_step=_rotation(torso, planned, 1),
+        camera_px_8_steps=_rotation(torso, planned, 8),
+        torque_rms_relative=_torque_rms(series["torque"], alive),
     )
 
 

@@ -49,16 +49,12 @@ class Walls:
         self._since = np.zeros(robots)  # s since the push
         self._times = np.zeros((robots, 3))  # s since the push: hands go, return, wall goes
         self._hands = np.zeros((robots, 3))  # m, aside, up, press
-        self._active = np.zeros(robots, dtype=np.bool_)
-
-    @property
-    def active(self) -> NDArray[np.bool_]:
+        self.active: NDArray[np.bool_] = np.zeros(robots, dtype=np.bool_)
         """(N,) robots before a wall."""
-        return self._active
 
     def remove(self, rows: NDArray[np.intp]) -> None:
         """Take the walls of ``rows`` away."""
-        self._active[rows] = False
+        self.active[rows] = False
         self.position[rows] = NO_WALL
 
     def push(
@@ -71,7 +67,7 @@ class Walls:
         """
         rng, n = self._rng, len(rows)
         chosen = self._commands.standing[rows] & (rng.random(n) < self._config.wall)
-        chosen &= ~self._active[rows]
+        chosen &= ~self.active[rows]
         ahead = heading(rotation_matrix(x.quaternion[rows]))
         facing = np.arctan2(ahead[:, 1], ahead[:, 0])
         palms = to_heading_xy(x.palms[rows] - x.position[rows][:, None], ahead)[..., 0].max(axis=1)
@@ -90,15 +86,15 @@ class Walls:
         at = rows[chosen]
         self.position[at], self.yaw[at] = surface[chosen], yaw[chosen]
         self._times[at], self._hands[at] = times[chosen], hands[chosen]
-        self._since[at], self._active[at] = 0.0, True
+        self._since[at], self.active[at] = 0.0, True
         self._commands.keep(at, times[chosen, 2])
         return chosen, kick
 
     def advance(self, x: Snapshot) -> None:
         """One controller tick: command bracing hands, remove walls that have been there enough."""
-        if not self._active.any():
+        if not self.active.any():
             return
-        rows = np.flatnonzero(self._active)
+        rows = np.flatnonzero(self.active)
         before = self._since[rows]
         self._since[rows] = since = before + 1 / CONTROLLER_HZ
         go, back, end = self._times[rows].T
@@ -128,7 +124,7 @@ class Walls:
     def distance(self, x: Snapshot) -> Array:
         """(N,) m from pelvis to wall; `NO_WALL_DISTANCE` if it is farther or absent."""
         near = np.clip(self._gap(x), 0.0, NO_WALL_DISTANCE)
-        return np.where(self._active, near, NO_WALL_DISTANCE)
+        return np.where(self.active, near, NO_WALL_DISTANCE)
 
     @property
     def _normal(self) -> Array:

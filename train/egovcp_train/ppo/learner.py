@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -24,7 +24,9 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_train.on_policy import Log, OnPolicyLearner, rsl_rl_config
-from egovcp_train.ppo.config import PpoTrainConfig
+
+if TYPE_CHECKING:
+    from egovcp_train.ppo.train import PpoTrainConfig
 
 
 class ContactEnv(VecEnv):  # type: ignore[misc]

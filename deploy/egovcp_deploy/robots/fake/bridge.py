@@ -55,12 +55,7 @@ class FakeBridge:
     bridge sends one temperature and no status.
     """
 
-    def __init__(
-        self,
-        robot: LiveRobot,
-        ports: Ports | None = None,
-        detailed: bool = False,
-    ) -> None:
+    def __init__(self, robot: LiveRobot, ports: Ports, detailed: bool = False) -> None:
         self.robot = robot
         self.faults = InjectedFaults()  # may be changed at any time
         self.pressed: frozenset[str] = frozenset()
@@ -78,7 +73,6 @@ class FakeBridge:
         self._sequence = 0
         self._depth: NDArray[np.uint16] | None = None  # of the last image
         self._context = zmq.Context()
-        ports = ports or Ports()
         try:
             self._commands, command_port = self._bind(zmq.PULL, ports.host, ports.command_port)
             self._states, state_port = self._bind(zmq.PUB, ports.host, ports.state_port)
