@@ -22,8 +22,9 @@ from egovcp_train.config import OptimizerConfig
 
 def linear(split: SplitLinear) -> nn.Linear:
     """One layer on the concatenated inputs, with the same weights."""
-    layer = nn.Linear(split.inputs, split.parts[0].weight.shape[0], bias=False)  # type: ignore[index, arg-type]
-    layer.weight.data = torch.cat([part.weight.data for part in split.parts], 1)  # type: ignore[misc]
+    weight = torch.cat([part.weight.data for part in split.parts], 1)  # type: ignore[misc]
+    layer = nn.Linear(*reversed(weight.shape), bias=False)
+    layer.weight.data = weight
     return layer
 
 

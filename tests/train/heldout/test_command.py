@@ -170,6 +170,12 @@ def test_results_are_never_overwritten(
     assert (tmp_path / "heldout.json").read_text() == "{}"
 
 
-def test_numbers_that_are_not_finite_are_null(tmp_path: Path) -> None:
-    command._write(tmp_path, report.HeldoutReport({"value/r2": float("nan")}, {}, {}, {}), {})
+def test_numbers_that_are_not_finite_are_null(
+    policy: Path, dataset_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = report.HeldoutReport({"value/r2": float("nan")}, {}, {}, {})
+    monkeypatch.setattr(command, "measure", lambda *args: result)
+    monkeypatch.setattr(command, "table", lambda tasks: "")
+    monkeypatch.setattr(command, "_show", lambda *args: None)
+    assert main(_argv(policy, dataset_root, tmp_path)) == 130
     assert json.loads((tmp_path / "heldout.json").read_text())["all_tasks"] == {"value/r2": None}
