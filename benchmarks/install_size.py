@@ -1,13 +1,14 @@
 """Installed size of each application with all its dependencies, MB.
 
 Sums the files of every distribution that the application requires, as installed in this
-environment; "without torch" leaves out torch, its CUDA libraries and triton.
+environment; "without torch" leaves out torch, triton and the distributions nvidia-* and cuda-*.
 
     python benchmarks/install_size.py
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from functools import cache
 from importlib import metadata
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.suppor
 from tests.support.requirements import installed_with
 
 APPLICATIONS = ("egovcp", "egovcp-collect", "egovcp-train", "egovcp-deploy", "egovcp-experiment")
-_TORCH = ("torch", "triton", "nvidia-", "cuda-")
+_TORCH = re.compile(r"torch|triton|(nvidia|cuda)-.+")  # whole names
 
 
 @cache
@@ -35,7 +36,7 @@ def sizes_mb() -> dict[str, object]:
     figures: dict[str, object] = {}
     for application in APPLICATIONS:
         sizes = {name: size_mb(name) for name in installed_with(application)}
-        without = sum(mb for name, mb in sizes.items() if not name.startswith(_TORCH))
+        without = sum(mb for name, mb in sizes.items() if not _TORCH.fullmatch(name))
         figures[f"{application}_mb"] = sum(sizes.values())
         figures[f"{application}_without_torch_mb"] = without
     return figures

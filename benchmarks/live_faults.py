@@ -1,7 +1,8 @@
 """Every fault, many times, against the fake G1 over ZMQ, on loaded cores.
 
-Writes the table of docs/robot.md. Fails (exit code 1) if a reaction is not the required one, or if
-the 99th percentile of the time to DAMP of any fault that requires it is above 250 ms.
+Prints a row per kind; docs/robot.md summarises them. Fails (exit code 1) if a reaction is not the
+required one, or if the 99th percentile of the time to DAMP of any kind with a DAMP deadline is
+above 250 ms. After Ctrl-C the runs so far are summed up (exit code 130).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from report import parser, publish
 
+from egovcp.entry_point import INTERRUPTED
 from egovcp_deploy.live.control_process import raise_priority
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
@@ -57,9 +59,13 @@ def cpu_load(processes: int) -> Iterator[None]:
             process.join()
 
 
-def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[FaultRun]:
-    """All faults in turn, ``repetitions`` times; those without a DAMP deadline less often."""
-    rows = []
+def run_all(kinds: Sequence[FaultKind], repetitions: int) -> tuple[list[FaultRun], bool]:
+    """All faults in turn, ``repetitions`` times; those without a DAMP deadline less often.
+
+    Returns:
+        the runs; whether Ctrl-C ended them early.
+    """
+    rows, interrupted = list[FaultRun](), False
     rig = FaultRig()
     try:
         for repetition in range(repetitions):
@@ -72,10 +78,11 @@ def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[FaultRun]:
                     print(f"{kind.name}: {row.problem}", file=sys.stderr, flush=True)
             print(f"{repetition + 1} of {repetitions}", file=sys.stderr, flush=True)
     except KeyboardInterrupt:
+        interrupted = True
         print(f"interrupted: {len(rows)} runs are summed up", file=sys.stderr)
     finally:
         rig.close()
-    return rows
+    return rows, interrupted
 
 
 def damp_p99(rows: Sequence[FaultRun]) -> dict[str, float | None]:
@@ -88,7 +95,7 @@ def damp_p99(rows: Sequence[FaultRun]) -> dict[str, float | None]:
 
 
 def figures(rows: Sequence[FaultRun], p99: dict[str, float | None]) -> dict[str, object]:
-    """Flat keys: per kind, whose ``p99`` `damp_p99` computes, and over all."""
+    """Metrics in one flat dict: per kind, and over all runs."""
     out: dict[str, object] = {"kinds": len({row.kind.name for row in rows}), "runs": len(rows)}
     for name in p99:
         same = [row for row in rows if row.kind.name == name]
@@ -108,7 +115,7 @@ def figures(rows: Sequence[FaultRun], p99: dict[str, float | None]) -> dict[str,
 
 
 def over_limit(rows: Sequence[FaultRun], p99: dict[str, float | None]) -> list[str]:
-    """Kinds that must damp and whose ``p99`` exceeds the limit."""
+    """Kinds with a DAMP deadline whose ``p99`` (`damp_p99`) exceeds the limit."""
     late = []
     for name in dict.fromkeys(r.kind.name for r in rows if r.kind.reaction is Reaction.DAMP):
         ms = p99[name]
@@ -123,7 +130,7 @@ def main() -> None:
         "--repetitions",
         type=int,
         default=20,
-        help="runs of each kind that must damp; a quarter as many of the others",
+        help="runs of each kind with a DAMP deadline; a quarter as many of the others",
     )
     p.add_argument("--only", default="", help="kinds whose name contains this")
     p.add_argument(
@@ -135,7 +142,7 @@ def main() -> None:
     with cpu_load(args.load):
         # Raise the simulator's priority so that the reaction time excludes its scheduling delay.
         raise_priority(RIG_PRIORITY)
-        rows = run_all(kinds, args.repetitions)
+        rows, interrupted = run_all(kinds, args.repetitions)
     table = markdown(rows)
     print(table)
     if args.markdown is not None:
@@ -148,6 +155,8 @@ def main() -> None:
         print(f"problem: {line}", file=sys.stderr)
     if problems or late:
         sys.exit(1)
+    if interrupted:
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
+from egovcp.model.latent_state import SHIFT
 from egovcp.model.networks import SplitLinear, SplitMlp
 from egovcp_train.config import OptimizerConfig
 
@@ -65,8 +66,9 @@ class PlainModel(nn.Module):
         self.posterior = copy.deepcopy(model.posterior.rest)
         self.prior = mlp(model.prior)
         self.decoder_input = copy.deepcopy(model.decode_depth.project)
+        self.patch = model.decode_depth.PATCH
         patches = copy.deepcopy(model.decode_depth.layers)
-        self.decode_depth = nn.Sequential(*patches, nn.PixelShuffle(model.decode_depth.PATCH))
+        self.decode_depth = nn.Sequential(*patches, nn.PixelShuffle(self.patch))
         self.decode_state = mlp(model.decode_state)
         self.termination = mlp(model.termination_head)
         self.value = mlp(model.value_head)
@@ -77,7 +79,7 @@ class PlainModel(nn.Module):
 
     def gaussian(self, logits: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = logits.chunk(2, -1)
-        return mean, F.softplus(raw + 0.54) + self.config.min_std
+        return mean, F.softplus(raw + SHIFT) + self.config.min_std
 
     def transition(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
         new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
@@ -86,12 +88,13 @@ class PlainModel(nn.Module):
     def decode_image(self, features: Tensor) -> Tensor:
         """(N, features) -> nearness (N, 48, 64)."""
         maps = self.decoder_input(features)
-        maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
+        rows, cols = spec.DEPTH_ROWS // self.patch, spec.DEPTH_COLS // self.patch
+        maps = maps.view(len(maps), -1, rows, cols)
         image: Tensor = self.decode_depth(maps)[:, 0]
         return image
 
 
-def widest(x: Tensor) -> Tensor:
+def max_pool_3x3(x: Tensor) -> Tensor:
     """(N, H, W) -> maximum over 3 x 3 pixels."""
     return F.max_pool2d(x[:, None], 3, stride=1, padding=1)[:, 0]
 
@@ -100,7 +103,7 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
     """(N, H, W) mm -> nearness in [0, 1], small holes closed."""
     near = (1 - depth_mm.float() * (1e-3 / max_m)).clamp(0, 1)
     near = torch.where(depth_mm == 0, torch.zeros_like(near), near)
-    return -widest(-widest(near))
+    return -max_pool_3x3(-max_pool_3x3(near))
 
 
 def mean_where(x: Tensor, mask: Tensor) -> Tensor:
@@ -109,6 +112,7 @@ def mean_where(x: Tensor, mask: Tensor) -> Tensor:
 
 
 def unbroken(batch: Batch, k: int) -> Tensor:
+    """(B, T - k) whether rows t and t + k are valid rows of one episode."""
     episode = batch.is_first.long().cumsum(1)
     last = episode.shape[1] - k
     return (episode[:, k:] == episode[:, :last]) & batch.valid[:, k:] & batch.valid[:, :last]
@@ -117,7 +121,7 @@ def unbroken(batch: Batch, k: int) -> Tensor:
 def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
     """Weight of every pixel, (B, T, H, W)."""
     before = near[:, :-1].flatten(0, 1)
-    high, low = (x.view_as(near[:, 1:]) for x in (widest(before), -widest(-before)))
+    high, low = (x.view_as(near[:, 1:]) for x in (max_pool_3x3(before), -max_pool_3x3(-before)))
     threshold = loss.motion_threshold
     moving = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
     moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
@@ -219,9 +223,9 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
         batch.terminal_next.float(),
         reduction="none",
     )
-    ahead = torch.cat([h[:, :-1], z[:, :-1], batch.action[:, 1:]], -1)
+    next_features = torch.cat([h[:, :-1], z[:, :-1], batch.action[:, 1:]], -1)
     known = usable[:, 1:] & unbroken(batch, 1)
-    imagined = mean_where(value_error(model.value(ahead), target[:, 1:]), known)
+    imagined = mean_where(value_error(model.value(next_features), target[:, 1:]), known)
     return [
         loss.value * value,
         loss.termination * mean_where(fall, batch.valid),
@@ -239,18 +243,18 @@ def multistep_terms(
     generator: torch.Generator,
 ) -> list[Tensor]:
     loss, length = model.config.loss, near.shape[1]
-    ahead = [k for k in loss.multistep_horizons if k < length]
-    every = min(loss.multistep_stride, length - min(ahead))
+    horizons = [k for k in loss.multistep_horizons if k < length]
+    every = min(loss.multistep_stride, length - min(horizons))
     first = int(torch.randint(every, (), generator=generator))
-    start = torch.arange(first, length - min(ahead), every)
+    start = torch.arange(first, length - min(horizons), every)
     h, z = (x[:, start] for x in states)
     seen, rows, known = [], [], []
-    for k in range(1, max(ahead) + 1):
+    for k in range(1, max(horizons) + 1):
         start = start[start + k < length]
         h, z = h[:, : len(start)], z[:, : len(start)]
         h = model.transition(h, z, batch.action[:, start + k - 1])
         z = model.gaussian(model.prior(h))[0]
-        if k in ahead:
+        if k in horizons:
             seen.append(torch.cat([h, z], -1))
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])

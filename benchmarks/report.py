@@ -1,4 +1,5 @@
-"""Options, timing and output of all benchmarks: flat keys and the hardware."""
+"""Shared by the benchmarks: options, timing, and output (one flat dict of metrics, with the
+hardware)."""
 
 from __future__ import annotations
 
@@ -33,18 +34,23 @@ def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def parser(description: str | None, rounds: int | None = 15) -> argparse.ArgumentParser:
+class _HelpFormatter(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Shows defaults, and keeps the lines of the description."""
+
+
+def parser(
+    description: str | None, rounds: int | None = 15, rounds_help: str = "measurements of each case"
+) -> argparse.ArgumentParser:
     """Options that all benchmarks share.
 
     Args:
         rounds: default of ``--rounds``; None: there is no such option.
+        rounds_help: what ``--rounds`` counts.
     """
-    p = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
-    )
+    p = argparse.ArgumentParser(description=description, formatter_class=_HelpFormatter)
     p.add_argument("--json", type=Path, help="also write the metrics to this file")
     if rounds is not None:
-        p.add_argument("--rounds", type=int, default=rounds, help="measurements of each case")
+        p.add_argument("--rounds", type=int, default=rounds, help=rounds_help)
     return p
 
 

@@ -1,9 +1,10 @@
 """Survival of a low-level controller in physics that it was not trained in.
 
 Plays the skills of `egovcp-eval-lowlevel` in each variant, with the robots, commands and pushes
-of the reference (stock feet, 5 ms steps, the ranges of --disturbances). Prints the survival in the
-reference and, per variant, its difference in percentage points, * where it is more than 3 below;
-then the worst difference of each variant with its 95 % interval, paired by robot.
+of the reference (stock feet, 5 ms steps, the default ranges of `egovcp-eval-lowlevel
+--disturbances`). Prints the survival in the reference and, per variant, its difference in
+percentage points, * where it is more than 3 below; then the worst difference of each variant with
+its 95 % interval, paired by robot.
 
     python benchmarks/sim_to_sim.py --controller walk --episodes 400
 """

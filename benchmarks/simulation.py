@@ -112,11 +112,7 @@ def milliseconds_per_tick(config: CollectConfig) -> dict[str, float]:
     named["tick_total_ms"] = 1e3 * total / ticks
     parts = ("controller", "physics", "depth", "depth_noise")
     rest = named["tick_total_ms"] - sum(named[f"tick_{part}_ms"] for part in parts)
-    return {
-        **named,
-        "tick_rest_ms": rest,
-        "tick_physics_and_rest_ms": named["tick_physics_ms"] + rest,
-    }
+    return {**named, "tick_rest_ms": rest}
 
 
 @contextlib.contextmanager

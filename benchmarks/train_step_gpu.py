@@ -69,8 +69,8 @@ def cases(store: EpisodeStore, size: int, on_cpu: bool) -> dict[str, Callable[[]
 
         for _ in range(WARM_UP_STEPS if device.type == "cuda" else 0):
             step()
-        if mine.unrecorded:
-            raise SystemExit(f"a step cannot be recorded: {mine.unrecorded}")
+        if mine.capture_error:
+            raise SystemExit(f"a step cannot be recorded: {mine.capture_error}")
         return step
 
     own = choose_bf16("auto", GPU)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -30,6 +31,7 @@ from egovcp.files import (
     JSON_LIMIT_BYTES,
     UnsafeFileError,
     read_bytes,
+    removed_on_error,
     sha256,
     write_bytes,
 )
@@ -104,14 +106,17 @@ class Artifact:
 def save_artifact(
     path: Path, model: WorldModel, planner: PlannerConfig, provenance: dict[str, Any]
 ) -> None:
-    """Write the artifact into a folder, which is created, with the manifest as the last file.
+    """Write the artifact to a temporary folder, then rename it into place.
 
     Args:
+        path: folder to create; an older artifact there is replaced once the new one is
+            complete, and stays on an error.
         provenance: entries of the manifest; must hold ``controller_id``.
 
     Raises:
         ArtifactError: the provenance names no controller, or a number in it is not finite.
     """
+    _require_controller_id(path, provenance)
     config = {
         "type": "egovcp",
         "world_model": draccus.encode(model.config),
@@ -119,9 +124,13 @@ def save_artifact(
         "input_features": input_features(model.robot),
         "output_features": output_features(model.robot),
     }
-    write_artifact(
-        path, config, model.state_dict(), provenance, processors(model.robot), model.robot
-    )
+    with removed_on_error(path.with_name(path.name + ".partial")) as work:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        write_artifact(
+            work, config, model.state_dict(), provenance, processors(model.robot), model.robot
+        )
+        _replace(path, work)
 
 
 def write_artifact(
@@ -132,18 +141,18 @@ def write_artifact(
     processors: Mapping[str, Any],
     robot: RobotSpec = G1,
 ) -> None:
-    """Write the files of an artifact; see `save_artifact`.
+    """Write the files of an artifact into a folder that exists; see `save_artifact`.
 
     Args:
         config: LeRobot's configuration of the policy, with ``world_model`` and ``planner``.
+        weights: the state of the world model.
         processors: JSON file name -> content; empty: they are not written.
+        robot: the robot of the world model.
 
     Raises:
         ArtifactError: the provenance names no controller, or a number in it is not finite.
     """
-    if not isinstance(provenance.get("controller_id"), str):
-        raise ArtifactError(f"{folder}: the provenance of a policy must hold its controller_id")
-    folder.mkdir(parents=True, exist_ok=True)
+    _require_controller_id(folder, provenance)
     write_json_file(folder / CONFIG, config)
     for name, content in processors.items():
         write_json_file(folder / name, content)
@@ -157,6 +166,26 @@ def write_artifact(
         **provenance,
     }
     write_manifest(folder, manifest)
+
+
+def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
+    if not isinstance(provenance.get("controller_id"), str):
+        raise ArtifactError(f"{path}: the provenance of a policy must hold its controller_id")
+
+
+def _replace(path: Path, new: Path) -> None:
+    """Rename folder ``new`` to ``path``, replacing it; on an error the old folder stays."""
+    old = path.with_name(path.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        path.rename(old)
+    try:
+        new.rename(path)
+    except OSError:
+        if old.exists():
+            old.rename(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artifact:

@@ -128,6 +128,11 @@ def preset_defaults(
 
 
 _MESSAGE_LIMIT: Final = 2000
+#: Errors of a path on the command line.
+_PATH_ERRNOS: Final = {
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ENOENT),
+    *(errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO, errno.ENODEV, errno.ESPIPE),
+}
 #: Errors of the system, with or without a file.
 _ENVIRONMENT_ERRNOS: Final = {
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EADDRINUSE),
@@ -145,7 +150,7 @@ def _user_error(error: OSError | UnicodeEncodeError) -> EgovcpError | None:
     reason = f"{error.strerror}: {error.filename or ''}".rstrip(": ")
     if error.errno in _ENVIRONMENT_ERRNOS:
         return EnvironmentFailure(reason)
-    if error.filename is not None:
+    if error.errno in _PATH_ERRNOS and error.filename is not None:
         return UsageError(f"{reason}; check the path")
     return None
 

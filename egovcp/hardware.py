@@ -16,7 +16,9 @@ _CGROUP: Final = Path("/sys/fs/cgroup")
 
 def available_cores() -> int:
     """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def require_memory(option: str, needed: int) -> None:
@@ -36,9 +38,12 @@ def available_bytes() -> int:
 
 
 def _of_the_system() -> int:
-    lines = _MEMINFO.read_text(encoding="ascii").splitlines()
-    (kilobytes,) = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
-    return int(kilobytes) * 1024
+    if _MEMINFO.exists():
+        for line in _MEMINFO.read_text(encoding="ascii").splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return int(value.split()[0]) * 1024
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
 def _of_the_container() -> int:
@@ -57,10 +62,13 @@ def hardware() -> dict[str, object]:
     """Flat description of the hardware for reports of timings."""
     import torch  # processes that only simulate do not import it
 
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
     return {
-        "hardware_cpu": models[0] if models else platform.machine(),
+        "hardware_cpu": model,
         "hardware_cores": os.cpu_count() or 1,
         "hardware_gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "torch": torch.__version__,

@@ -1,4 +1,4 @@
-"""Options of commands that play a policy artifact."""
+"""Options of commands that play a policy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from egovcp.plan.config import (
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Which policy artifact."""
+    """Which policy."""
 
     path: str = ""
     """Folder of the artifact, its Hub id `user/name`, or `contact`, which ships with egovcp (a
@@ -38,7 +38,7 @@ class PolicyOptions:
 
 @dataclass(frozen=True)
 class PlannerOptions:
-    """Overrides of the planner options of the artifact."""
+    """Changes to the policy's planner."""
 
     samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""

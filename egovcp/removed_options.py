@@ -52,6 +52,7 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     "train.task_flags": "all tasks share one recipe: use --train.flags",
     "play.task_flags": "all tasks share one recipe: use --play.flags",
     "value_fit": "Q is trained with the world model and not fitted again afterwards: leave it out",
+    "network.activation": "the networks of a controller have ELU units: leave it out",
     "policy.value_units": "the head of Q is as wide as every MLP: use --policy.units",
     "optimizer.value_replay": (
         "Q is fitted to a privileged value instead of single returns: leave it out"
@@ -78,6 +79,7 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
 PROGRAMS: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("backend", "ray"), ("egovcp-collect", "egovcp-experiment")),
     "format": ("egovcp-export",),
+    "network.activation": ("egovcp-train-lowlevel",),
     "realtime": ("egovcp-deploy",),
     "return_steps": ("egovcp-eval-model",),
 }

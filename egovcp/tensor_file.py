@@ -36,14 +36,19 @@ class TensorFile:
         Raises:
             UnsafeFileError: it is not a safetensors file.
         """
+        length = int.from_bytes(content[:_LENGTH_BYTES], "little")
+        if length > HEADER_LIMIT_BYTES:
+            raise UnsafeFileError(
+                f"not a safetensors file, or its header of {length} bytes is longer than "
+                f"{HEADER_LIMIT_BYTES}"
+            )
         try:
             tensors = dict(deserialize(content))  # type: ignore[no-untyped-call]
         except SafetensorError as error:
             raise UnsafeFileError(f"not a safetensors file, or truncated: {error}") from error
-        end = _LENGTH_BYTES + int.from_bytes(content[:_LENGTH_BYTES], "little")
-        header = json.loads(content[_LENGTH_BYTES:end])  # `deserialize` has checked it
+        header = json.loads(content[_LENGTH_BYTES : _LENGTH_BYTES + length])  # checked by then
         return cls(
-            metadata=header.get("__metadata__", {}),
+            metadata=header.get("__metadata__") or {},
             dtypes={name: tensor["dtype"] for name, tensor in tensors.items()},
             shapes={name: tuple(tensor["shape"]) for name, tensor in tensors.items()},
             content=content,

@@ -18,10 +18,11 @@ import numpy as np
 from tqdm import tqdm
 
 from egovcp.cli import preset_defaults, run_command
+from egovcp.data import DatasetConfig
 from egovcp.data.committer import Committer, open_committer
 from egovcp.data.episode import frame_layout
 from egovcp.data.source import local_root
-from egovcp.errors import EnvironmentFailure
+from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hardware import available_cores
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.config import EnvConfig
@@ -36,7 +37,7 @@ from egovcp_collect.worker_pool import Worker, WorkerPool
 
 PROG: Final = "egovcp-collect"
 _EPILOG: Final = (
-    "Every finished episode is stored on the disk at once. After an interruption the same command "
+    "Every episode is written to disk as soon as it ends. After an interruption the same command "
     "with --resume continues; with more --episodes it extends the dataset."
 )
 MIN_COMPRESSED_SHARE: Final = 0.2
@@ -60,12 +61,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def collect(config: CollectConfig, command: str = "") -> None:
     """Simulate the missing episodes, commit them shard by shard, and print a summary.
 
-    If it ends early, every finished episode is staged on the disk, and the longest sequence of
-    them without a gap is in the dataset.
+    If it ends early, finished episodes are kept: the dataset holds them up to the first one that is
+    missing, and the others stay staged on the disk for --resume.
 
     Raises:
         UsageError: an option is invalid, or the destination exists.
-        DataError: the existing data are damaged, or the simulation diverged.
+        DataError: the existing data or a staged episode are damaged, or the simulation diverged.
         EnvironmentFailure: another process writes the dataset, there is too little disk space, or
             workers die repeatedly.
         OSError: the disk is full.
@@ -75,7 +76,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
     config = replace(config, env=resolve_config(config.env, config.tasks))
     provenance = make_provenance(config, command)
     check_existing = partial(require_compatible, provenance) if config.resume else None
-    root = local_root(config.dataset)
+    root = local_root(DatasetConfig(config.dataset.repo_id, config.dataset.root))
     with open_committer(root, provenance, config.shard_episodes, check_existing) as committer:
         missing = _missing_scenarios(config, committer)
         if missing:
@@ -89,7 +90,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
             mininterval=0.5 if sys.stderr.isatty() else 10,
         ) as bar:
             try:
-                steps = _simulate(config, missing, committer, bar)
+                steps, stopped = _simulate(config, missing, committer, bar)
             except BaseException as error:
                 _commit_after(error, committer)
                 raise
@@ -99,8 +100,13 @@ def collect(config: CollectConfig, command: str = "") -> None:
         echo(
             f"{committer.committed} episodes, {committer.frames} steps, {rate:.0f} steps/s{waiting}"
         )
-        if committer.committed < config.episodes:
+        if stopped and committer.committed < config.episodes:
             raise KeyboardInterrupt
+        if committer.committed < config.episodes:  # the first missing one stopped the commit
+            raise DataError(
+                f"the staged file of episode {committer.next_number} was damaged on the disk or "
+                "removed; run the same command with --resume to simulate it again"
+            )
 
 
 def _commit_after(error: BaseException, committer: Committer) -> None:
@@ -150,10 +156,13 @@ def require_disk_space(
 
 def _simulate(
     config: CollectConfig, scenarios: Sequence[Scenario], committer: Committer, bar: Any
-) -> int:
-    """Planner ticks until every episode is staged, or until a stop signal."""
+) -> tuple[int, bool]:
+    """Simulate until every episode is staged or a stop signal arrives.
+
+    Returns the simulated planner ticks, summed over the robots, and whether a signal arrived.
+    """
     if not scenarios:
-        return 0
+        return 0, False
     start = partial(Worker, config, committer.staging.folder)
     count = config.num_workers or available_cores()
     pool = WorkerPool(start, count, scenarios, config.num_envs, config.worker_timeout)
@@ -170,7 +179,7 @@ def _simulate(
             bar.update(0)
             if committer.next_shard_is_complete:
                 committer.commit()
-    return steps
+        return steps, bool(stopped)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
-from egovcp.data import DatasetConfig
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds, check_cores
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
@@ -21,17 +20,28 @@ EPISODE_OPTIONS: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary"
 
 
 @dataclass(frozen=True)
+class NewDatasetConfig:
+    """Where the new dataset is written."""
+
+    repo_id: str = ""
+    """Dataset id, `user/name`; without root it names LeRobot's local folder."""
+    root: str = ""
+    """Folder of the new dataset; empty: $HF_LEROBOT_HOME/REPO_ID."""
+
+
+@dataclass(frozen=True)
 class CollectConfig:
     """Simulate episodes under random actions; write them as a LeRobot dataset."""
 
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """The new dataset; without a root it goes to LeRobot's local folder under its id."""
+    dataset: NewDatasetConfig = field(default_factory=NewDatasetConfig)
+    """Where the new dataset is written."""
     task: str = DEFAULT_TASK
     """Task to collect: one of `egovcp-task list`, package.module:Class, several as ball,wall, or
     all. Several are interleaved."""
     preset: str = "default"
-    """Starting point of all options: default (actions change every 5 to 15 steps, short episodes),
-    or paper (actions change at every step, with full-length episodes, as in evaluation)."""
+    """Starting point of all options: default (actions change every 5 to 15 planner ticks, short
+    episodes), or paper (actions change at every planner tick, with full-length episodes, as in
+    evaluation)."""
     mix: dict[str, float] = bounded({}, least=0)
     """Relative share of planner ticks per task, '{ball: 2}'; 1 for tasks not listed."""
     episodes: int = bounded(200, least=1, most=10**6)
@@ -41,7 +51,8 @@ class CollectConfig:
     shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=65_536)
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
-    """Episode i depends on (seed, i) only, not on the number of workers."""
+    """With the other options fixed, episode i depends only on (seed, i), not on --episodes,
+    --num_workers or --num_envs."""
     num_workers: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """Simulation processes; 0: one per processor core."""
     worker_timeout: float = bounded(120.0, least=1)
@@ -52,8 +63,8 @@ class CollectConfig:
     """Largest step of the random walk, action box units; a step above the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
     step_ticks: tuple[int, int] = bounded((5, 15), least=1, most=100_000)
-    """Shortest and longest interval between steps of the walk, planner ticks; (1, 1) is the
-    paper's walk."""
+    """Shortest and longest interval between steps of the walk, planner ticks; (1, 1) needs
+    --eta of 0.32 or less; --preset=paper is the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """How the walk stays inside the action box; clipping accumulates actions on its faces."""
     env: EnvConfig = field(default_factory=short_episodes)
@@ -62,13 +73,18 @@ class CollectConfig:
     def check(self) -> None:
         """Raise `UsageError` for invalid values and combinations."""
         check_bounds(self, "--")
+        check_cores(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes)
         require_memory_for_robots("--num_envs", self.num_envs, robots)
-        for task in set(self.mix) - set(select_tasks(self.task, training=True)):
-            raise UsageError(f"--mix.{task}: --task={self.task} does not have this task")
+        tasks = select_tasks(self.task, training=True)
+        if unknown := sorted(set(self.mix) - set(tasks)):
+            raise UsageError(
+                f"--mix.{unknown[0]}: --task={self.task} does not have this task, but "
+                f"{', '.join(tasks)}"
+            )
         shortest, longest = self.step_ticks
         if shortest > longest:
             raise UsageError(
@@ -84,8 +100,6 @@ class CollectConfig:
             )
         if not self._weights():
             raise UsageError(f"--mix={self.mix}: expected at least one weight above 0")
-        if self.dataset.revision:
-            raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
 
     @property
     def tasks(self) -> tuple[str, ...]:

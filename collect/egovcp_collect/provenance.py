@@ -28,6 +28,7 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
         controller_id=controller_id_of(config.env, config.tasks),
         seed=config.seed,
         command=command,
+        # Python is recorded for information only: `require_compatible` does not compare it.
         versions={"python": platform.python_version(), **versions_of(_PACKAGES)},
         config={
             **{name: settings[name] for name in EPISODE_OPTIONS},
@@ -69,8 +70,8 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
-        **dict(differences(_migrated(before.config), _migrated(now.config), "--")),
         **dict(differences(before_versions, now_versions, "version of ")),
+        **dict(differences(_migrated(before.config), _migrated(now.config), "--")),
     }
     changed = [
         f"{name} was {old}, is {new}"

@@ -86,10 +86,10 @@ class Simulation:
 
 
 class EpisodeRecord:
-    """The rows of one episode: (o[t], a[t], r[t], flags)."""
+    """The frames of one episode: (o[t], a[t], r[t], flags)."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, list[Any]] = defaultdict(list)
+        self._frames: dict[str, list[Any]] = defaultdict(list)
         self._term_sums: dict[str, float] = defaultdict(float)
         self._term_ticks: Counter[str] = Counter()
         self._contact_ticks: Counter[str] = Counter()
@@ -102,8 +102,8 @@ class EpisodeRecord:
         row: int,
         instance: BaseInstance,
     ) -> None:
-        """Append row ``row`` of the environment: the observation before a step, the object (4,) at
-        that time, and the result of the step."""
+        """Append the frame of row ``row`` of the environment: the observation before a step, the
+        object (4,) at that time, and the result of the step."""
         columns = instance.task.reward_terms
         terms = {name: float(result.reward_terms[name][row]) for name in columns}
         sums: dict[str, float] = {}  # not from 0.0, which would turn -0.0 into 0.0 in the digest
@@ -121,7 +121,7 @@ class EpisodeRecord:
             "object": known_object,
         }
         for name, value in values.items():
-            self._rows[name].append(value)
+            self._frames[name].append(value)
         for name in columns:
             self._term_sums[name] += terms[name]
             self._term_ticks[name] += terms[name] != 0
@@ -130,9 +130,9 @@ class EpisodeRecord:
 
     def episode(self, instance: BaseInstance) -> Episode:
         """The finished episode."""
-        rows: dict[str, Any] = {name: np.stack(values) for name, values in self._rows.items()}
+        frames: dict[str, Any] = {name: np.stack(values) for name, values in self._frames.items()}
         return Episode(
-            **rows,
+            **frames,
             robot=instance.task.robot_spec(),
             task=instance.scenario.task,
             time_limit=instance.task.ticks_limit,

@@ -21,7 +21,7 @@ class OperatorOptions:
     addition."""
 
     type: Literal["auto", "keyboard"] = "auto"
-    """auto: stands up, arms and runs automatically. keyboard: the keys of this terminal."""
+    """auto: stands up, arms and runs by itself; keyboard: the keys of this terminal."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Velocity of auto while running: vx, vy (m/s), yaw rate (rad/s)."""
     duration: float = bounded(0.0, least=0)
@@ -30,18 +30,15 @@ class OperatorOptions:
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Drive a robot with a policy artifact at 25 Hz and record each rollout.
-
-    --controller=oracle shows how a task is solved, without an artifact.
-    """
+    """Drive a robot with a policy at 25 Hz and record each rollout."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artifact; only for the controller `planner`."""
+    """The policy; only for the controller `planner`."""
     controller: Literal["planner", "hold", "random", "oracle"] = "planner"
-    """What drives the robot: planner, or in simulation a reference without an artifact: hold
+    """What drives the robot: planner, or in simulation a reference without a policy: hold
     (neutral pose), random (the paper's walk) or oracle (scripted, uses the simulator's state)."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artifact's planner."""
+    """Changes to the policy's planner."""
     robot: RobotOptions = field(default_factory=RobotOptions)
     """The robot."""
     operator: OperatorOptions = field(default_factory=OperatorOptions)
@@ -54,9 +51,9 @@ class DeployConfig:
     (several in one episode, --env.sequence.parts), or package.module:Class. It is no input of the
     policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
-    """Number of rollouts."""
+    """Number of rollouts in simulation; a unitree_g1 makes one."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Which held-out scenarios."""
+    """Which held-out scenarios; on a unitree_g1, seed of the planner."""
     output_dir: str = ""
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)

@@ -119,7 +119,7 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
     try:
         content = read_json(path)
         constants = {task: _parse(task, entry) for task, entry in content["constants"].items()}
-        known = {name: content.get(name) for name in setting}
+        known = {name: content[name] for name in setting}
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"cannot read --constant.path={path}: {reason}") from error

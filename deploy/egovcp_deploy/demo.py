@@ -35,13 +35,13 @@ class DemoConfig:
     """
 
     policy: PolicyOptions = field(default_factory=lambda: PolicyOptions("contact"))
-    """The policy artifact."""
+    """The policy."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artifact's planner."""
+    """Changes to the policy's planner."""
     task: str = "sequence"
     """Scene: sequence (arch, ball and wall in turn), or another name from `egovcp-task list`."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Which held-out scenario."""
+    """Number of the held-out scenario."""
     live: str = ""
     """Also show the episode as it is played: web (a page for browsers), or spawn (the Rerun
     viewer)."""

@@ -181,9 +181,9 @@ def _draw(
 
 
 class EpisodePool:
-    """Plays groups in worker processes that last until `close`. One worker plays in this process,
-    with ``artifact`` if it is loaded already. Once ``stopped()`` is true, episodes in progress are
-    abandoned."""
+    """Plays groups in worker processes that last until `close`; with a single worker, in this
+    process and with ``artifact``, else each one loads the policy. Once ``stopped()`` is true,
+    episodes in progress are abandoned."""
 
     def __init__(
         self,

@@ -85,9 +85,9 @@ class EvalConfig:
     """Evaluate planner and reference controllers on held-out scenarios; print and save metrics."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artifact; only for the controller `planner`."""
+    """The policy; only for the controller `planner`."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artifact's planner."""
+    """Changes to the policy's planner."""
     task: str = DEFAULT_TASK
     """A name from `egovcp-task list`, package.module:Class, several as ball,wall, or all; sequence
     plays several in one episode (--env.sequence.parts)."""

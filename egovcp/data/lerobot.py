@@ -15,7 +15,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from egovcp.data import metadata, schema
@@ -166,17 +165,15 @@ class LeRobotReader:
         Raises:
             DataError: its rows are missing or damaged, or the file is.
         """
-        path = row.data_path
-        self.open_data(path)
-        try:
-            with data_errors(path):
-                own = pc.field("episode_index") == row.index
-                table = pq.read_table(path, columns=[*keys], filters=own, partitioning=None)
-        except DataError as error:
-            raise DataError.at(path, error.problem, row.index) from error
-        if not len(table):
-            raise DataError.at(path, "has no rows of this episode", row.index)
-        return table
+        file = self.open_data(row.data_path)
+        columns = [*dict.fromkeys([*keys, "episode_index"])]
+        for found in episode_runs(file, row.data_path, columns, only=row.index):
+            if isinstance(found, DataError):
+                if found.episode in (None, row.index):
+                    raise found
+            elif found[0] == row.index:
+                return found[1]
+        raise DataError.at(row.data_path, "has no rows of this episode", row.index)
 
     def _table_rows(self, path: Path) -> Iterator[EpisodeRow]:
         require_file(self.root, path)
@@ -239,17 +236,23 @@ def explained(error: DataError) -> DataError:
 
 
 def episode_runs(
-    file: pq.ParquetFile, path: Path, columns: Sequence[str] | None
+    file: pq.ParquetFile,
+    path: Path,
+    columns: Sequence[str] | None = None,
+    only: int | None = None,
 ) -> Iterator[tuple[int, pa.Table] | DataError]:
     """(``episode_index``, rows) of the consecutive rows of each episode in a data file.
 
     Episodes may span row groups, which are read one at a time. A damaged one gives an error for
-    each of its episodes, if they can be determined.
+    each of its episodes, if they can be determined. Row groups whose statistics exclude the episode
+    ``only`` are skipped.
     """
     number, parts = -1, list[pa.Table]()
     for group in range(file.num_row_groups):
         try:
             with data_errors(path):
+                if only is not None and not _may_hold(file.metadata.row_group(group), only):
+                    continue
                 table = file.read_row_group(group, columns=columns, use_threads=False)
                 runs = list(_split_by_episode(table))
         except DataError as error:
@@ -288,3 +291,12 @@ def _episode_numbers(file: pq.ParquetFile, group: int) -> list[int]:
         return sorted(set(column.drop_null().to_pylist()))
     except (pa.ArrowException, OSError):
         return []
+
+
+def _may_hold(group: pq.RowGroupMetaData, episode: int) -> bool:
+    """Whether the row group may hold rows of the episode, by its statistics."""
+    for column in map(group.column, range(group.num_columns)):
+        if column.path_in_schema == "episode_index" and column.is_stats_set:
+            found = column.statistics
+            return not found.has_min_max or found.min <= episode <= found.max
+    return True

@@ -25,19 +25,22 @@ ReturnScaling = Literal["dataset", "none"]
 
 @dataclass(frozen=True)
 class ReturnConfig:
-    """Discount, horizon, weights and normalisation of the returns that Q is trained on."""
+    """Discount and reward weights of Q, and the Monte Carlo returns that normalise its target.
+
+    By default Q is fitted to a critic (`q_target` privileged), and these returns only give the
+    target's mean and standard deviation; with `q_target` mc they are the target."""
 
     gamma: float = bounded(spec.GAMMA, least=0, most=1)
     """Discount per planner tick."""
     steps: int = bounded(spec.RETURN_STEPS, least=1, most=100_000)
-    """Horizon K, planner ticks."""
+    """Horizon K of the Monte Carlo returns, planner ticks."""
     weights: dict[str, float] = field(default_factory=dict)
     """Weights of reward terms, '{block: 2.0}'; 1 for terms not listed, 0 for those that the planner
     computes (pose, action_rate)."""
     keep_truncated: bool = False
-    """Train on returns that the time limit cuts short, too (the paper's choice)."""
+    """Use Monte Carlo returns that the time limit cuts short, too (the paper's choice)."""
     scale: ReturnScaling = "dataset"
-    """Normalisation of the return targets: dataset (over all tasks), or none."""
+    """Normalisation of Q's target: by the returns of the dataset (over all tasks), or none."""
 
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for invalid values."""

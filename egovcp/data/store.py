@@ -79,6 +79,7 @@ class EpisodeStore:
         readers: Sequence[DatasetReader],
         split: str = "all",
         returns: ReturnConfig | None = None,
+        *,
         per_task: int | None = None,
     ) -> Self:
         """Read the episodes of a split, at most ``per_task`` of each task, into memory.

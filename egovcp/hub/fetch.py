@@ -1,4 +1,4 @@
-"""Repository ids, and resumable downloads of one commit."""
+"""Repository ids, and downloads of one commit: resumable, compared with the Hub's list of files."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from egovcp.errors import DataError
+from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub.errors import HubUnreachable, RepoType, hub_token
+from egovcp.hub.publish import Content
 from egovcp.hub.retry import RetryPolicy, call_hub
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+    from huggingface_hub.hf_api import RepoFile
 
 _LOG = logging.getLogger(__name__)
 _NAME: Final = r"[A-Za-z0-9_](?:[\w.-]*\w)?"
@@ -98,24 +103,29 @@ def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
     Files of an interrupted call are reused; other files are removed.
 
     Raises:
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
+        EnvironmentFailure: the Hub cannot be reached, refuses, or sends a file that differs from
+            its list; that file is removed, so that the next call downloads it again.
     """
-    call_hub(partial(_download, repo_id, commit, folder), retry, repo_id, commit)
+    listing = call_hub(partial(_download, repo_id, commit, folder), retry, repo_id, commit)
+    for name, file in listing.items():
+        path = folder / name
+        if not path.is_file() or not Content(path).matches(file):
+            path.unlink(missing_ok=True)
+            raise EnvironmentFailure(
+                f"{name} differs from the Hub's hash of it; the file was removed and will be "
+                "downloaded again by the next attempt"
+            )
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # LeRobot would download again
 
 
-def _download(repo_id: str, commit: str, folder: Path) -> None:
-    """Remove foreign files and download the others."""
+def _download(repo_id: str, commit: str, folder: Path) -> dict[str, RepoFile]:
+    """Remove foreign files and download the others; returns the Hub's list of them."""
     from huggingface_hub import HfApi, snapshot_download
 
-    files = HfApi(token=hub_token()).list_repo_files(repo_id, repo_type="dataset", revision=commit)
-    for name in files:
-        if name.startswith("/") or ".." in name.split("/"):
-            raise DataError(f"{repo_id}@{commit} holds {name!r}, a path outside the dataset")
-    wanted = set(files) - set(_FOREIGN)
+    listing = _listing(HfApi(token=hub_token()), repo_id, commit)
     for found in folder.rglob("*"):
         relative = found.relative_to(folder)
-        foreign = relative.parts[0] != ".cache" and relative.as_posix() not in wanted
+        foreign = relative.parts[0] != ".cache" and relative.as_posix() not in listing
         if foreign and found.is_file():
             found.unlink()
     snapshot_download(
@@ -126,3 +136,15 @@ def _download(repo_id: str, commit: str, folder: Path) -> None:
         ignore_patterns=list(_FOREIGN),
         max_workers=_WORKERS,
     )
+    return listing
+
+
+def _listing(api: HfApi, repo_id: str, commit: str) -> dict[str, RepoFile]:
+    from huggingface_hub.hf_api import RepoFile
+
+    tree = api.list_repo_tree(repo_id, repo_type="dataset", revision=commit, recursive=True)
+    files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+    for path in files:
+        if path.startswith("/") or ".." in path.split("/"):
+            raise DataError(f"{repo_id}@{commit} holds {path!r}, a path outside the dataset")
+    return {path: file for path, file in files.items() if path not in _FOREIGN}

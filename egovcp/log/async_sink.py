@@ -40,7 +40,7 @@ def warn_on_stderr(line: str) -> None:
 
 
 class AsyncSink:
-    """Writes to ``sink`` in a separate process, which runs until `close`.
+    """Writes to ``sink`` in a separate process.
 
     `write` always returns at once. `open` waits until the sink is open and raises its errors, so
     that a run does not start with a log that cannot be written.
@@ -65,8 +65,8 @@ class AsyncSink:
         self._sink, self.name = sink, name
         self._capacity = queue_ticks
         self._close_timeout_s, self._warn = close_timeout_s, warn
-        self._process = _WriterProcess()
-        self._ended = self._opened = self._closed = False
+        self._process: _WriterProcess | None = None
+        self._opened = self._closed = False
         self._accepted = self._written = self._gap = 0
         self.dropped = 0
         """Number of ticks dropped because the queue was full or the sink had failed."""
@@ -80,11 +80,20 @@ class AsyncSink:
 
     @property
     def pid(self) -> int:
-        """Process id of the writer."""
+        """Process id of the writer, from `start` to `close`."""
+        assert self._process is not None, "it runs from `start` to `close`"
         return self._process.pid
+
+    def start(self) -> None:
+        """Start the process without waiting for it. `open` calls this; starting several sinks
+        before opening the first saves time."""
+        if self._process is None:
+            self._process = _WriterProcess()
 
     def open(self, info: RunInfo) -> None:
         """Open the sink in its process, and wait for it; raises its error."""
+        self.start()
+        assert self._process is not None
         self._process.outbox.put(pack((self._sink, info)))
         self._await(lambda: self._opened, START_TIMEOUT_S)
         if not self._opened:
@@ -98,25 +107,26 @@ class AsyncSink:
         self.write_packed(tick, pack(tick))
 
     def write_packed(self, tick: Tick, packed: bytes) -> None:
-        outbox = self._process.outbox
+        process = self._process
+        assert process is not None, "open the sink before writing to it"
         self._pump()
-        if self.failure is not None or len(outbox) >= self._capacity:
+        if self.failure is not None or len(process.outbox) >= self._capacity:
             self.dropped += 1
             self._gap += 1
             return
-        outbox.put(pack(self._with_gap(tick)) if self._gap else packed)
+        process.outbox.put(pack(self._with_gap(tick)) if self._gap else packed)
         self._accepted += 1
         self._pump()
 
     def close(self) -> None:
         """Close the sink, waiting at most ``close_timeout_s``; report lost ticks."""
-        if self._ended:
+        if self._process is None:
             return
         if self._opened and self.failure is None:
             self._process.outbox.put(pack(None))
             self._await(lambda: self._closed, self._close_timeout_s)
         self._process.kill()
-        self._ended = True
+        self._process = None
         self._report_losses()
 
     def _with_gap(self, tick: Tick) -> Tick:
@@ -126,6 +136,7 @@ class AsyncSink:
 
     def _await(self, ready: Callable[[], bool], timeout_s: float) -> None:
         """Pump until ``ready``, a failure, or the timeout."""
+        assert self._process is not None
         end = time.monotonic() + timeout_s
         while self.failure is None and not ready() and (left := end - time.monotonic()) > 0:
             self._process.wait(left)
@@ -133,6 +144,7 @@ class AsyncSink:
 
     def _pump(self) -> None:
         """Exchange bytes with the process without blocking."""
+        assert self._process is not None
         if self.failure is not None or self._closed:
             return
         try:
@@ -173,6 +185,8 @@ class AsyncFanout(Fanout[AsyncSink]):
 
     def open(self, info: RunInfo) -> None:
         """Open every sink; if one fails, close all and raise its error."""
+        for sink in self.sinks:
+            sink.start()
         try:
             super().open(info)
         except BaseException:

@@ -80,7 +80,8 @@ class LiveRerun:
     """A viewer process.
 
     ``spawn``: the native viewer, which stays open after the run. ``web``: a server for browsers,
-    which ends with this process; `page` is its URL. ``connect``: a viewer that runs already.
+    which ends with this process (after SIGKILL only if util-linux is installed); `page` is its
+    URL. ``connect``: a viewer that runs already.
     """
 
     kind: Kind

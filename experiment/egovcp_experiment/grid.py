@@ -3,7 +3,8 @@
 collect-TASK-COUNT
 train-TASK-MODEL-sSEED     on the data of a task, or with the task `all` on that of all tasks
 play-TASK-VARIANT-sSEED    the planner with that model; `default` without changed flags
-references-TASK            hold, random and oracle on the same scenarios
+bounds-TASK                hold, random and oracle on the same scenarios
+references-TASK            the same with constant, which needs an expensive search
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class Grid:
         """Name of the cell of reference controllers, on the planner's scenarios in a changed
         ``scene``."""
         flags = {**self.scenarios(task), "controllers": ",".join(controllers), **(scene or {})}
-        return self.add(Cell(name or f"references-{task}", PLAY, flags)).name
+        return self.add(Cell(name or f"bounds-{task}", PLAY, flags)).name
 
     def study(
         self, name: str, task: str, flags: Flags, extra: Sequence[str] = (), exclusive: bool = False

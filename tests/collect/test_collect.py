@@ -110,11 +110,11 @@ def test_the_last_line_reports_episodes_steps_and_speed(
         (["--step_ticks=[9,4]"], "shortest <= longest"),
         (["--boundary=bounce"], "bounce"),
         (["--task=ball,wall", "--mix={ball: 0, wall: 0}"], "weight above 0"),
-        (["--task=ball,wall", "--mix={arch: 2}"], "does not have this task"),
+        (["--task=ball,wall", "--mix={arch: 2}"], "does not have this task, but ball, wall"),
         (["--task=all", "--env.controller=stance"], "'stance' does not walk"),
         (["--task=arch", "--env.controller=stance"], "--env.controller=walk"),
         (["--episode=3"], "did you mean '--episodes'"),
-        (["--dataset.revision=main"], "no meaning for a new dataset"),
+        (["--dataset.revision=main"], "--dataset.revision"),
     ],
 )
 def test_invalid_options_are_usage_errors_in_one_line(
@@ -160,6 +160,26 @@ def test_an_error_is_not_hidden_by_a_failed_commit(
     assert lines[-1] == "egovcp-collect: error: the simulation failed"
     (warning,) = [line for line in lines if "warning" in line]
     assert "No space left" in warning
+
+
+def test_a_damaged_staged_episode_is_a_data_error_and_no_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(
+        WorkerPool,
+        "poll",
+        lambda pool, poll=WorkerPool.poll: [_damage_last(tmp_path, r) for r in poll(pool)],
+    )
+    assert _collect(tmp_path / "new", "--episodes=1", "--num_envs=1", "--num_workers=1") == 3
+    err = capsys.readouterr().err
+    assert "staged file of episode 0 was damaged" in err
+    assert "--resume" in err
+
+
+def _damage_last[R](folder: Path, report: R) -> R:
+    for path in folder.glob(".new.collect/sealed/*.arrow"):
+        path.write_bytes(b"damaged")
+    return report
 
 
 def test_episodes_of_a_diverging_simulation_are_not_stored(

@@ -1,7 +1,6 @@
 """What a run is resumed from is refused, with one line that names the file, if it is damaged."""
 
 import os
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -46,8 +45,7 @@ def test_the_training_state_is_read_without_executing_code(tmp_path: Path) -> No
     torch.save({"step": _Bomb()}, file)
     _refuses_to_load(tmp_path, "its SHA-256")
     file.with_name(DIGEST_FILE).write_text(f"{sha256(file)}  {STATE_FILE}\n")
-    with pytest.raises(pickle.UnpicklingError):
-        load_training_state(tmp_path)
+    _refuses_to_load(tmp_path, "not a training state")
 
 
 def test_a_training_state_without_digest_is_refused(tmp_path: Path) -> None:

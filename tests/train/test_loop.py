@@ -67,7 +67,7 @@ def test_the_third_such_step_in_a_row_ends_the_run() -> None:
     learner = _learner()
     learner.update(_bad(), 0.0)
     learner.update(_bad(), 0.0)
-    with pytest.raises(DataError, match="not finite for 3 steps in a row"):
+    with pytest.raises(DataError, match="not finite in 3 consecutive steps"):
         learner.update(_bad(), 0.0)
 
 
@@ -167,7 +167,7 @@ def test_recorded_steps_learn_the_same_bit_for_bit(
         assert all(found[name].equal(value) for name, value in expected.items())
     assert _same(_weights(plain), _weights(recorded))
     assert 1 < recorder.made < 12  # one for each row that may be the first
-    assert not recorded.unrecorded
+    assert not recorded.capture_error
 
 
 def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
@@ -175,13 +175,13 @@ def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
         raise RuntimeError("operation not permitted")
 
     learner, plain = _learner(), _learner()
-    assert not learner.unrecorded
+    assert not learner.capture_error
     learner._gradients = GraphedFunction(learner._compute_gradients, refuse, copies=False)
     for seed in range(3):
         learner.update(random_batch(2, 3, seed), 0.0)
         plain.update(random_batch(2, 3, seed), 0.0)
     assert _same(_weights(learner), _weights(plain))
-    assert learner.unrecorded == "operation not permitted"
+    assert learner.capture_error == "operation not permitted"
 
 
 @pytest.mark.gpu
@@ -197,7 +197,7 @@ def test_on_a_gpu_steps_are_recorded_and_the_same(bf16: bool) -> None:
         assert found.keys() == expected.keys()
         for name, value in expected.items():
             torch.testing.assert_close(found[name], value, rtol=2e-2, atol=2e-3, msg=name)
-    assert not recorded.unrecorded
+    assert not recorded.capture_error
     assert len(recorded._gradients._graphs) > 1  # one for each row that may be the first
 
 

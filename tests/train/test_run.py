@@ -70,7 +70,7 @@ def test_a_gpu_that_cannot_record_steps_is_said_once(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Learner, "unrecorded", "operation not permitted")
+    monkeypatch.setattr(Learner, "capture_error", "operation not permitted")
     assert main(arguments(tmp_path / "run", log_freq=1)) == 0
     said = re.findall("cannot be recorded as a CUDA graph .*", capsys.readouterr().out)
     assert len(said) == 1
@@ -266,7 +266,9 @@ def test_a_loss_that_is_not_a_number_ends_the_run_at_once(
     options = {f"optimizer__{name}": value for name, value in explosive.items()}
     assert main(arguments(tmp_path / "run", steps=100, save_freq=100, **options)) == 3
     last_line = capsys.readouterr().err.splitlines()[-1]
-    assert re.match(r"egovcp-train: error: the loss was not finite for 3 steps", last_line)
+    assert last_line.startswith(
+        "egovcp-train: error: loss or gradient was not finite in 3 consecutive steps"
+    )
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 

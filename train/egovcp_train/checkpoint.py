@@ -146,8 +146,7 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         ArtifactError: there is none, or it cannot be read.
     """
     with _open_training_state(output_dir) as file:
-        state: dict[str, Any] = torch.load(file, map_location="cpu", weights_only=True)
-        return state
+        return _load(file)
 
 
 @contextmanager
@@ -188,9 +187,21 @@ def restoring(output_dir: Path) -> Iterator[None]:
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise ArtifactError(
-            f"{output_dir}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
+            f"{output_dir}: its checkpoint does not fit the options given, or is of another "
+            f"version ({reason}); resume without them, or start a new run"
         ) from error
+
+
+def _load(file: IO[bytes]) -> dict[str, Any]:
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # the unpickler raises any exception on bytes of another program
+        raise UnsafeFileError("not a training state") from error
+    if not isinstance(state, dict):
+        raise UnsafeFileError("not a training state")
+    return state
 
 
 def pretrained_weights(model: WorldModel, path: str) -> dict[str, torch.Tensor]:

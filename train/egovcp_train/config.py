@@ -125,7 +125,7 @@ class PolicyConfig(WorldModelConfig):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Train the ego-vision world model from a LeRobot dataset and write a policy artifact.
+    """Train the ego-vision world model from a LeRobot dataset and write a policy.
 
     The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id); --datasets
     mixes several. Checkpoints follow LeRobot's layout:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -56,14 +57,17 @@ def export(config: ExportConfig) -> None:
         raise UsageError("--policy.path and --output_dir are needed: the policy, and a new folder")
     output = prepare_output(config.output_dir, resume=False, resumable=False)
     artifact = load_artifact(config.policy.path, config.policy.revision)
-    with removed_on_error(output):
-        write_half_precision(artifact, output)
-        write_text(output / CARD, card_text(load_artifact(str(output)), ""))
+    with removed_on_error(output.with_name(output.name + ".partial")) as work:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        write_half_precision(artifact, work)
+        os.replace(work, output)
+    write_text(output / CARD, card_text(load_artifact(str(output)), ""))
     echo(f"{output / WEIGHTS}: {(output / WEIGHTS).stat().st_size / 1e6:.1f} MB")
 
 
 def write_half_precision(artifact: Artifact, folder: Path) -> None:
-    """Write a copy of an artifact with float16 weights.
+    """Write a copy of an artifact with float16 weights to the existing ``folder``.
 
     The statistics of the data stay float32. `load_artifact` converts all to float32. Of absolute
     paths in the provenance, which mean nothing on another machine, only the names remain.

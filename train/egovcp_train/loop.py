@@ -23,11 +23,11 @@ from egovcp_train.device import precision
 from egovcp_train.privileged_value import Critic
 
 _MOST_GRAPHS: Final = 64
-"""One for each row or image that may be the first (`egovcp.model.StepNoise`): 8 of the default."""
+"""At most one graph per combination of the integers in `StepNoise`; the default recipe has 8."""
 _CRITIC_START: Final = 0.1
-"""Part of a run in which the critic is not changed: Q, which chooses the next actions of its
-target, does not rank actions yet."""
-_MAX_SKIPPED: Final = 3  # steps in a row whose loss or gradient is not finite
+"""Part of the run before the critic is updated: until then Q, which chooses the critic's next
+action, cannot rank actions."""
+_MAX_SKIPPED: Final = 3  # consecutive steps whose loss or gradient is not finite
 
 type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...], Carry]
 """Names and values (n,) of the terms, the gradients of all parameters, the filtered states."""
@@ -77,7 +77,7 @@ class Learner:
             )
 
     @property
-    def unrecorded(self) -> str:
+    def capture_error(self) -> str:
         """Why a step could not be captured on this GPU; empty if it was."""
         return self._gradients.error if isinstance(self._gradients, GraphedFunction) else ""
 
@@ -93,15 +93,15 @@ class Learner:
             parameter.grad = gradient
         terms = dict(zip(names, values.clone(), strict=True))
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
-        total = norm + terms["loss/total"]
+        probe = norm + terms["loss/total"]
         critic = self.critic if progress >= _CRITIC_START else None
         if critic:
             critic.set_learning_rate(self.config.privileged_value.training_lr * lr / self.config.lr)
             terms["loss/critic"] = critic.compute_gradients(
                 self.model, batch, states, noise.actions, self.generator, self.bf16
             )
-            total = total + terms["loss/critic"]
-        if self._is_finite(total):
+            probe = probe + terms["loss/critic"]
+        if self._accept_step(probe):
             self.optimizer.step()
             self._average()
             if critic:
@@ -140,17 +140,24 @@ class Learner:
                 "last good checkpoint, if there is one, is kept: lower --optimizer.lr"
             )
 
-    def _is_finite(self, sums: Tensor) -> bool:
-        """Whether the step is taken; raises `DataError` at the third in a row that is not."""
-        if torch.isfinite(sums):
+    def _accept_step(self, probe: Tensor) -> bool:
+        """Count the step as good or skipped; returns whether it is taken.
+
+        Args:
+            probe: sum of the losses and the norm of the gradient; not finite if one of them is not.
+
+        Raises:
+            DataError: `_MAX_SKIPPED` consecutive steps are skipped.
+        """
+        if torch.isfinite(probe):
             self._skipped = 0
             return True
         self._skipped += 1
         if self._skipped >= _MAX_SKIPPED:
             raise DataError(
-                f"the loss was not finite for 3 steps in a row (step {self.step + 1}); the last "
-                "good checkpoint, if there is one, is kept: check the dataset, or lower "
-                "--optimizer.lr"
+                f"loss or gradient was not finite in {_MAX_SKIPPED} consecutive steps (step "
+                f"{self.step + 1}); the last good checkpoint, if there is one, is kept: check the "
+                "dataset, or lower --optimizer.lr"
             )
         return False
 

@@ -79,7 +79,9 @@ class Transitions:
 
     def __init__(self, model: WorldModel, store: EpisodeStore) -> None:
         """Those of ``store``, on the device of ``model``, whose normalisation is used."""
-        self.model, device, robot = model, model.state_mean.device, store.robot
+        self.model = model
+        device = model.state_mean.device
+        robot = store.robot
         self.inputs = self.mirrored = Inputs.of(model, store.state, store.privileged, store.action)
         if robot.mirror is not None:
             self.mirrored = Inputs.of(
@@ -313,7 +315,6 @@ def fit(
             critic.set_learning_rate(config.lr * 0.5 * (1 + math.cos(math.pi * done)))
             critic.fit_step(model, rows, config.rows, generator, bf16)
             bar.update()
-    critic.set_learning_rate(config.training_lr)
     return critic
 
 
@@ -326,13 +327,13 @@ def prepare(
     """`fit` the critic of a run, and say how well it agrees with returns.
 
     Returns:
-        None if the target of Q is another one, also because the data lacks positions of objects.
+        None unless q_target=privileged and every dataset records object positions.
     """
     config = data.config
     if config.policy.loss.q_target != "privileged":
         return None
     if not has_objects(data.heldout):
-        echo("the data has no positions of objects: Q is fitted to returns")
+        echo("not every dataset has positions of objects: Q is fitted to returns")
         return None
     critic = fit(
         model,

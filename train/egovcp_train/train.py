@@ -236,9 +236,9 @@ class TrainingRun:
                 if learner.step % config.log_freq == 0:
                     self._log({k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
-                    if learner.unrecorded and not warned:
+                    if learner.capture_error and not warned:
                         warned = True
-                        bar.write(one_line(_UNRECORDED.format(reason=learner.unrecorded)))
+                        bar.write(one_line(_UNRECORDED.format(reason=learner.capture_error)))
 
     def _pause(self) -> None:
         """Measure, save and record what is due between two steps."""

@@ -94,7 +94,7 @@ def _render(
         title=f"{name.partition('/')[2]}: Unitree G1, {', '.join(tasks)}",
         tasks=[{"name": task, "about": describe_task(task)} for task in tasks],
         episodes=len(reader),
-        steps=reader.num_frames,
+        frames=reader.num_frames,
         hours=f"{reader.num_frames / reader.fps / 3600:.2f}",
         fps=reader.fps,
         codebase_version=schema.CODEBASE_VERSION,

@@ -26,8 +26,9 @@ class CheckConfig:
     """Read every file and every frame of a LeRobot v3 dataset, and print file, episode and frame of
     each problem. Exits with code 3 if there is one.
 
-    Datasets of egovcp must also keep its own contract. Of others, whatever their features, it
-    prints in one line each what it cannot check."""
+    Datasets that egovcp collected are also checked against their hashes and recorded digests, for
+    repeated episodes, and for actions that agree with the commands. Of others, whatever their
+    features, it prints in one line each what it cannot check."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, which is checked without network access, or an id of the Hub."""
@@ -69,7 +70,7 @@ def run_check(config: CheckConfig) -> None:
         more = " or more" if len(problems) == config.max_problems else ""
         raise DataError(
             f"{len(problems)}{more} problem(s) in {root}, the first: {problems[0]}; "
-            f"`egovcp-dataset repair {root} --output_dir=NEW` keeps the episodes that are sound"
+            f"`egovcp-dataset repair {root} --output_dir=NEW` keeps the valid episodes"
         )
     echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
 

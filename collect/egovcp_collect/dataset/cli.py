@@ -20,11 +20,12 @@ COMMANDS: Final = CommandGroup(
             ("merge", "rewrite:run_merge", "join datasets of the same controller", "others"),
             ("coverage", "coverage:run_coverage", "report events, returns, actions; assess it", ""),
             ("card", "card:run_card", "write its dataset card, README.md, with plots", ""),
-            ("viz", "viz:run_viz", "show an episode in Rerun, or write it as MCAP", ""),
-            ("push", "hub:run_push", "publish it on the Hub: data, card and tags, one commit", ""),
+            ("viz", "viz:run_viz", "write an episode as a Rerun or MCAP recording", ""),
+            ("push", "hub:run_push", "publish data and card in one commit, and tag it", ""),
             ("pull", "hub:run_pull", "download one commit from the Hub to a new folder", ""),
         )
     },
-    "DATASET is a folder, or an id of the Hub (user/name) where no such folder exists.",
+    "DATASET: a folder or, if there is none of that name, a Hub id user/name. push, repair and the "
+    "OTHERS of merge take folders only; pull takes a Hub id.",
 )
 main = COMMANDS.main

@@ -15,7 +15,7 @@ from egovcp.data.features import values_of
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.data.stats import aggregate_named
-from egovcp.errors import DataError
+from egovcp.errors import DataError, UsageError
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
@@ -35,17 +35,18 @@ class CoverageLimits:
     """Limits beyond which a dataset may be unsuitable for training. They are estimates: 2000 ball
     episodes with 800 blocks were enough to train Q."""
 
-    event_episodes: int = 100  # least episodes of a task with a block, hit, pass, fall, ...
+    event_episodes: int = 100  # least episodes of a task with a success or failure event
     event_episodes_per_1000: float = 0.5  # least such episodes per 1000 ticks
-    good_rows: float = 0.01  # least share of rows with a reward event ahead
-    valid_rows: float = 0.2  # least share of rows whose return the time limit does not cut short
+    # least share of frames with a success event ahead; a failure event, if there are costs only
+    event_frames: float = 0.01
+    valid_frames: float = 0.2  # least share of frames with a return not cut short by the time limit
     return_std: float = 0.02  # least standard deviation of the return
     one_outcome: float = 0.98  # largest share of episodes with the same outcome
     uniformity: float = 0.7  # least uniformity of an action
     occupied: float = 0.5  # least share of a hand's grid cells that hold an action
     valid_pixels: float = 0.05  # least share of measured pixels; an empty room is mostly far away
     empty_frames: float = 0.25  # largest share of frames without a measured pixel
-    balance: float = 0.5  # least share of a task's steps, relative to equal shares
+    balance: float = 0.5  # least share of a task's frames, relative to equal shares
 
 
 _LIMITS: Final = CoverageLimits()
@@ -56,18 +57,19 @@ class CoverageConfig:
     """Report event rates, returns, actions, depth and scenes of a dataset, and assess them.
 
     Reads all columns but depth, of which it samples. Failed checks do not change the exit code.
-    Of a LeRobot v3 dataset that egovcp did not collect, it reports the range of every number, and
-    those that are constant.
+    Of a dataset of another robot than the G1, or that egovcp did not collect, it reports the range
+    of every number, and those that are constant; plots are of the G1's datasets only.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
     output_dir: str = ""
-    """Folder for the plots events.png, returns.png, actions.png, depth.png; empty: none."""
+    """Folder for the plots events.png, returns.png, actions.png, depth.png (of datasets of the G1
+    only); empty: none."""
     json: str = output_file()
     """File for the statistics and the assessment as JSON; empty: none."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
-    """The Monte Carlo return that Q is trained on."""
+    """The Monte Carlo return in the report and the plots."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,16 @@ def run_coverage(config: CoverageConfig) -> None:
     root = locate(config.dataset).root
     reader = DatasetReader.open(config.dataset) if is_own(root) else None
     if reader is None or not reader.robot.is_g1:
+        if config.output_dir:
+            raise UsageError(
+                f"--output_dir: {root} is not a dataset of the G1 that egovcp collected, and plots "
+                "are of those only; drop it"
+            )
         write_report(config.json, _report_features(LeRobotReader.open(root)))
         return
     statistics = compute_statistics(reader, config.returns)
     checks = assess(statistics)
-    echo(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} steps\n")
+    echo(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} frames\n")
     for task in statistics.tasks:
         echo_lines([*_describe(task), ""])
     echo("assessment")
@@ -115,7 +122,7 @@ def coverage_column(task: TaskStatistics) -> dict[str, str]:
     r, d, length = task.returns, task.depth, task.length
     return {
         "episodes": f"{task.episodes}",
-        "steps": f"{task.steps} ({task.step_share:.0%})",
+        "frames": f"{task.steps} ({task.step_share:.0%})",
         "ticks per episode": f"{length.low:.0f} to {length.high:.0f}" if length else "none",
         "episodes that succeed": f"{task.success_share:.1%}",
         "episodes that end in a fall": f"{task.fall_share:.1%}",
@@ -123,8 +130,8 @@ def coverage_column(task: TaskStatistics) -> dict[str, str]:
             f"{r.spread.mean:.3f}, {r.spread.std:.3f}" if r.spread else "none"
         ),
         "return, 5 % to 95 %": f"{r.spread.q05:.3f} to {r.spread.q95:.3f}" if r.spread else "none",
-        "frames with a reward event within the return horizon": f"{r.positive_share:.1%}",
-        "frames with a cost event within the return horizon": f"{r.negative_share:.1%}",
+        "frames with a success event within the return horizon": f"{r.positive_share:.1%}",
+        "frames with a failure event within the return horizon": f"{r.negative_share:.1%}",
         "visited cells of the hand workspace": ", ".join(
             f"{hand} {share:.0%}" for hand, share in task.action.occupied.items()
         ),
@@ -178,10 +185,12 @@ def _checks(
         f"at least {limits.event_episodes}, and {limits.event_episodes_per_1000} per 1000 ticks: "
         "collect more, or shorten the episodes",
     )
+    kind = "success" if task.has_success_events else "failure"  # if the reward has costs only
     yield (
-        task.good_episodes > 0 and task.bad_episodes > 0,
-        f"{task.good_episodes} episodes with a good event, {task.bad_episodes} with a bad one",
-        "at least one of each",
+        task.bad_episodes > 0 and (task.good_episodes > 0 or not task.has_success_events),
+        f"{task.good_episodes} episodes with a success event, {task.bad_episodes} with a failure "
+        "event",
+        "at least one of each" if task.has_success_events else "at least one with a failure event",
     )
     success = task.success_share
     yield (
@@ -191,9 +200,9 @@ def _checks(
     )
     r = task.returns
     yield (
-        r.spread is not None and r.valid_share >= limits.valid_rows,
-        f"{r.valid_share:.0%} of the rows have a return over {r.steps} ticks",
-        f"at least {limits.valid_rows:.0%}: lengthen the episodes or shorten --returns.steps",
+        r.spread is not None and r.valid_share >= limits.valid_frames,
+        f"{r.valid_share:.0%} of the frames have a return over {r.steps} ticks",
+        f"at least {limits.valid_frames:.0%}: lengthen the episodes or shorten --returns.steps",
     )
     if r.spread is not None:
         yield (
@@ -202,10 +211,11 @@ def _checks(
             f"a standard deviation of at least {limits.return_std}",
         )
         yield (
-            r.positive_share >= limits.good_rows,
-            f"{r.positive_share:.1%} of the rows have a reward event ahead, "
-            f"{r.negative_share:.1%} a cost event",
-            f"at least {limits.good_rows:.0%} with a reward event",
+            (r.positive_share if task.has_success_events else r.negative_share)
+            >= limits.event_frames,
+            f"{r.positive_share:.1%} of the frames have a success event ahead, "
+            f"{r.negative_share:.1%} a failure event",
+            f"at least {limits.event_frames:.0%} with a {kind} event",
         )
     name, uniformity = min(task.action.uniformity.items(), key=lambda item: item[1])
     yield (
@@ -228,7 +238,7 @@ def _checks(
     )
     yield (
         task.step_share >= least_share,
-        f"{task.step_share:.0%} of the steps",
+        f"{task.step_share:.0%} of the frames",
         f"at least {least_share:.0%}: collect more of this task",
     )
 
@@ -260,7 +270,8 @@ def _report_features(reader: LeRobotReader) -> dict[str, Any]:
             numbers = (value[part] for part in ("min", "mean", "max", "std"))
             echo(f"  {name:38}" + "".join(f"{number:11.4g}" for number in numbers))
     warnings = [
-        f"{name} is always {value['mean']:g}: normalising divides by a standard deviation of 0"
+        f"{name} is always {value['mean']:g}: it carries no information, and normalisation "
+        "magnifies any later change"
         for values in features.values()
         for name, value in values.items()
         if value["std"] <= _CONSTANT * max(1.0, abs(value["mean"]))
@@ -291,10 +302,11 @@ def _feature_statistics(reader: LeRobotReader) -> dict[str, Statistics]:
                 raise found
             number, table = found
             for feature in features:
+                if feature.key not in table.column_names:
+                    raise DataError.at(path, f"column {feature.key} is missing", number)
                 try:
                     values = values_of(table[feature.key], feature)
-                except (DataError, KeyError) as error:
-                    problem = getattr(error, "problem", "") or f"column {error} is missing"
-                    raise DataError.at(path, problem, number) from error
+                except DataError as error:
+                    raise DataError.at(path, error.problem or str(error), number) from error
                 parts[feature.key].append((len(table), describe(values)))
     return {key: aggregate_named(found) for key, found in parts.items() if found}

@@ -49,7 +49,7 @@ class SplitConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
     splits: dict[str, float] = field(default_factory=lambda: {"train": 0.9, "test": 0.1})
-    """Name of each new dataset: its share of the episodes."""
+    """NAME: share, for each new dataset; what is left over is in none."""
     seed: int = bounded(0, least=0)
     """Seed of the random choice."""
     output_dir: str = ""
@@ -67,35 +67,37 @@ def run_delete(config: DeleteConfig) -> None:
     kept = sorted(set(range(count)) - set(left_out))
     if not kept:
         raise UsageError(f"--episodes={config.episodes} leaves no episode of {count}")
-    write_report(config.json, _write(reader, kept, config.output_dir))
+    output = new_folder(config.output_dir, [reader.root])
+    write_report(config.json, _write(reader, kept, output))
 
 
 def run_split(config: SplitConfig) -> None:
     """Write the new datasets."""
     reader, count = _open(config.dataset)
     total = sum(config.splits.values())
-    names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
-    shares = all(0 < share <= 1 for share in config.splits.values())
-    if not (config.splits and names and shares and total <= 1 + 1e-9):
+    valid_names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
+    valid_shares = all(0 < share <= 1 for share in config.splits.values())
+    if not (config.splits and valid_names and valid_shares and total <= 1 + 1e-9):
         raise UsageError(
             f"--splits={config.splits}: expected names of folders with shares that add up to 1 or "
             "less, such as {train: 0.9, test: 0.1}"
         )
     order = np.random.default_rng(config.seed).permutation(count)
-    result, first, share = {}, 0, 0.0
+    parts, first, share = dict[str, tuple[list[int], Path]](), 0, 0.0
     for name, part in config.splits.items():
         share += part
         end = math.floor(share * count + 0.5)
         if end <= first:
             raise UsageError(f"--splits: {name} would have none of the {count} episodes")
-        kept = sorted(order[first:end].tolist())
         output = str(Path(config.output_dir) / name) if config.output_dir else ""
-        result[name], first = _write(reader, kept, output), end
+        kept = sorted(order[first:end].tolist())
+        parts[name], first = (kept, new_folder(output, [reader.root])), end
+    result = {name: _write(reader, kept, output) for name, (kept, output) in parts.items()}
     write_report(config.json, result)
 
 
 def _open(config: DatasetConfig) -> tuple[DatasetReader | LeRobotReader, int]:
-    """A dataset with sound tables, and its number of episodes; prints what is not checked."""
+    """A dataset with valid tables, and its number of episodes; prints what is not checked."""
     root = locate(config).root
     if is_own(root):
         own = DatasetReader.open(config)
@@ -106,10 +108,9 @@ def _open(config: DatasetConfig) -> tuple[DatasetReader | LeRobotReader, int]:
 
 
 def _write(
-    reader: DatasetReader | LeRobotReader, kept: Sequence[int], output_dir: str
+    reader: DatasetReader | LeRobotReader, kept: Sequence[int], output: Path
 ) -> dict[str, int]:
-    """Write the episodes to the new dataset ``output_dir``."""
-    output = new_folder(output_dir, [reader.root])
+    """Write the episodes to the new dataset ``output``."""
     if isinstance(reader, DatasetReader):
         with DatasetWriter(output, reader.origin) as writer:
             for index in tqdm(kept, unit="ep", delay=1):

@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from egovcp.data import ReturnConfig
 from egovcp.packages import require_packages
-from egovcp.spec import ACTION_BOX, ACTION_NAMES, DEPTH_MAX_M, PLANNER_DT
+from egovcp.spec import ACTION_BOX, ACTION_NAMES, ACTION_TERMS, DEPTH_MAX_M, PLANNER_DT
 from egovcp_collect.dataset.statistics import (
-    BAD_TERMS,
-    GOOD_TERMS,
     HISTOGRAM_BINS,
     DatasetStatistics,
+    EventRate,
     TaskStatistics,
     events_ahead,
 )
 from egovcp_collect.dataset.task_data import SHOWN_FRAMES, DepthFrames, TaskRows
 
-_GOOD, _BAD, _NEUTRAL = "#1b7837", "#c0392b", "#8a8f98"
+_SUCCESS, _FAILURE, _NEUTRAL = "#1b7837", "#c0392b", "#8a8f98"
 _COLOURS: Final = ("#d95f02", "#7570b3", "#1b9e77", "#e7298a", "#66a61e", "#e6ab02")  # per task
 _AROUND_EVENT: Final = (-20, 160)  # ticks
 _GAP_PIXELS: Final = 2  # between depth images
@@ -75,10 +74,9 @@ def _events(tasks: Sequence[TaskStatistics]) -> Any:
     bars = max(len(task.events) for task in tasks)
     figure = _figure(4.2 * max(len(tasks), 2), 0.9 + 0.32 * bars)
     for axes, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        good, bad = GOOD_TERMS, (*BAD_TERMS, "touch.other")
         names = list(task.events)
         rates = [task.events[name].per_1000_ticks for name in names]
-        colours = [_GOOD if n in good else _BAD if n in bad else _NEUTRAL for n in names]
+        colours = [_event_colour(name, task.events[name]) for name in names]
         axes.barh(range(len(names)), rates, color=colours, height=0.7)
         axes.set_yticks(range(len(names)), names)
         axes.invert_yaxis()
@@ -91,9 +89,18 @@ def _events(tasks: Sequence[TaskStatistics]) -> Any:
             number = f"{rate:.0f}" if rate >= 100 else f"{rate:.2f}"
             text = f" {number}, in {event.episode_share:.0%} of episodes"
             axes.text(rate, i, text if event.ticks else " never", va="center", fontsize=8)
-        title = f"{task.task}: {task.episodes} episodes, {task.steps} steps"
+        title = f"{task.task}: {task.episodes} episodes, {task.steps} frames"
         _label(axes, "per 1000 ticks", title=title)
     return figure
+
+
+def _event_colour(name: str, rate: EventRate) -> str:
+    """The colour of a reward term by its sign; costs of actions are neutral."""
+    if name in ACTION_TERMS:
+        return _NEUTRAL
+    if name == "touch.other" or rate.sum < 0:
+        return _FAILURE
+    return _SUCCESS if rate.sum > 0 else _NEUTRAL
 
 
 def _returns(tasks: Sequence[TaskRows], config: ReturnConfig) -> Any:
@@ -110,17 +117,21 @@ def _returns(tasks: Sequence[TaskRows], config: ReturnConfig) -> Any:
 
 
 def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig) -> None:
-    good, bad = events_ahead(rows, config.steps)
-    kinds = {"a cost ahead": bad, "a reward, no cost ahead": good & ~bad, "neither": ~good & ~bad}
+    success, failure = events_ahead(rows, config.steps)
+    kinds = {
+        "a failure event ahead": failure,
+        "only success events ahead": success & ~failure,
+        "no event ahead": ~success & ~failure,
+    }
     valid = rows.mc_valid
     edges = np.histogram_bin_edges(rows.mc_return[valid], 60)
-    for (name, kind), colour in zip(kinds.items(), (_BAD, _GOOD, _NEUTRAL), strict=True):
+    for (name, kind), colour in zip(kinds.items(), (_FAILURE, _SUCCESS, _NEUTRAL), strict=True):
         label = f"{name} ({kind[valid].mean():.0%})"
         counts, _ = np.histogram(rows.mc_return[valid & kind], edges)
         axes.stairs(counts, edges, fill=True, alpha=0.55, color=colour, label=label)
     axes.set_yscale("symlog", linthresh=10)  # shows 0, too
     axes.set_ylim(0, None)
-    _label(axes, "Monte Carlo return", "rows", legend=True)
+    _label(axes, "Monte Carlo return", "frames", legend=True)
 
 
 def _return_around_event(axes: Any, rows: TaskRows, colour: str) -> None:

@@ -48,7 +48,7 @@ class DatasetPushConfig(PublishConfig):
     branch: str = "main"
     """Branch, which is created if needed. LeRobot's version tag follows `main` only."""
     message: str = ""
-    """Title of the commit; empty: number of episodes, steps, and tasks."""
+    """Title of the commit; empty: the numbers of episodes and frames, and the tasks."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class PullConfig:
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """The dataset: its id on the Hub, and the revision; empty: the latest."""
+    """The dataset: its id on the Hub, and optionally a revision; default: the latest commit."""
     output_dir: str = ""
     """The new folder."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
@@ -86,7 +86,7 @@ def run_push(config: DatasetPushConfig) -> None:
     with progress_bar("checking") as progress:
         check_dataset(DatasetConfig(root=str(reader.root)), progress)
     tasks = sorted({reader.task(i) for i in range(len(reader))})
-    size = f"{len(reader)} episodes, {reader.num_frames} steps"
+    size = f"{len(reader)} episodes, {reader.num_frames} frames"
     published = publish(
         Publication(
             repo_id=config.repo_id,
@@ -142,7 +142,7 @@ def run_pull(config: PullConfig) -> None:
         _download(source, config.network)
     reader = DatasetReader.open(DatasetConfig(root=str(root)))
     echo(f"{root}: {reader.source.repo_id}@{reader.source.commit}")
-    echo(f"{len(reader)} episodes, {reader.num_frames} steps")
+    echo(f"{len(reader)} episodes, {reader.num_frames} frames")
     echo(f"egovcp-train --dataset.root={root}")
     result = {
         "repo_id": reader.source.repo_id,

@@ -10,6 +10,7 @@ from typing import Any
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.index import in_split
 from egovcp.data.lerobot import LeRobotReader, is_own
+from egovcp.data.provenance import source_provenances
 from egovcp.data.source import Source, locate
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo_lines
@@ -43,13 +44,14 @@ def describe(reader: DatasetReader) -> dict[str, Any]:
     """The information, JSON-compatible."""
     lengths = enumerate(reader.lengths.tolist())
     identities = [reader.identity(i) for i in range(len(reader))]
-    provenance = reader.provenance
+    provenance, parts = reader.provenance, source_provenances(reader.origin)
     return {
         **_contents(reader, reader.source, [(reader.task(i), length) for i, length in lengths]),
         "episodes": len(reader),
         "heldout_episodes": sum(in_split(identities, "heldout")),
         "controller_id": reader.controller_id,
         "seed": provenance.get("seed"),
+        "seeds": list(dict.fromkeys(part.seed for part in parts if part.seed is not None)),
         "command": provenance.get("command", ""),
         "versions": dict(provenance.get("versions", {})),
     }
@@ -93,10 +95,11 @@ def _table(info: dict[str, Any]) -> list[str]:
     heldout = info.get("heldout_episodes")
     origin: list[tuple[str, object]]
     if "controller_id" in info:
+        seeds = info["seeds"]
         versions = ", ".join(f"{k} {v}" for k, v in info["versions"].items())
         origin = [
             ("controller", info["controller_id"]),
-            ("seed", "several" if info["seed"] is None else info["seed"]),
+            ("seed", "several" if len(seeds) > 1 else seeds[0] if seeds else "none"),
             ("command", info["command"] or "not recorded"),
             ("versions", versions or "not recorded"),
         ]

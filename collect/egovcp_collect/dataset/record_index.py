@@ -75,9 +75,10 @@ class RecordIndex:
     """The records of a dataset and of those that its episodes were taken from."""
 
     provenance: Provenance
-    records: Mapping[str | int, Record]
-    """`Episode.digest` -> record, of all datasets; index -> record, for records of the dataset
-    without a digest (collection version 1)."""
+    by_digest: Mapping[str, Record]
+    """`Episode.digest` -> record, of all datasets."""
+    by_index: Mapping[int, Record]
+    """Index of the episode -> record, of the records without a digest (collection version 1)."""
     recorded: int
     """Episodes that the dataset itself recorded."""
 
@@ -92,19 +93,23 @@ class RecordIndex:
         datasets = [*([own] if own else []), *(_read_original(path) for path in originals)]
         require_one_controller({path: origin.controller_id for path, origin, _ in datasets})
         provenances = [provenance for _, provenance, _ in datasets]
-        known: dict[str | int, Record] = {}
-        for index, (_, _, records) in enumerate(datasets):
-            for number, record in enumerate(records):
+        by_digest: dict[str, Record] = {}
+        by_index: dict[int, Record] = {}
+        for source, (_, _, records) in enumerate(datasets):
+            for index, record in enumerate(records):
                 if record:
-                    joined = join_metadata(record.get("metadata", {}), provenances, index)
-                    key = record.get("sha256") or number
-                    known.setdefault(key, {**record, "metadata": joined})
+                    joined = join_metadata(record.get("metadata", {}), provenances, source)
+                    found = {**record, "metadata": joined}
+                    if digest := record.get("sha256"):
+                        by_digest.setdefault(digest, found)
+                    else:
+                        by_index.setdefault(index, found)
         provenance = join_provenance(provenances, command)
-        return cls(provenance, known, len(own[2]) if own else 0)
+        return cls(provenance, by_digest, by_index, len(own[2]) if own else 0)
 
-    def find(self, digest: str, number: int) -> Record | None:
-        """The record of an episode, or None."""
-        return self.records.get(digest) or self.records.get(number)
+    def find(self, digest: str, index: int) -> Record | None:
+        """The record of the episode with this digest, or with this index; None if there is none."""
+        return self.by_digest.get(digest) or self.by_index.get(index)
 
 
 type _Dataset = tuple[Path, Provenance, Sequence[Record]]
@@ -135,7 +140,7 @@ def _read_damaged(root: Path, required: bool) -> _Dataset | None:
 
 
 def _read_original(root: Path) -> _Dataset:
-    """The records of a sound dataset; missing digests are computed."""
+    """The records of a valid dataset; missing digests are computed."""
     reader = DatasetReader.open(DatasetConfig(root=str(root)))
     records = [
         {

@@ -56,7 +56,7 @@ class MergeConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The first dataset."""
     others: list[str] = field(default_factory=list)
-    """Folders of the others; also those that follow the first without a flag."""
+    """Folders of the other datasets; they may also follow the first dataset without a flag."""
     output_dir: str = ""
     """Folder of the new dataset."""
     duplicates: Literal["refuse", "drop"] = "refuse"
@@ -96,18 +96,18 @@ def run_merge(config: MergeConfig) -> None:
     readers = [DatasetReader.open(dataset) for dataset in datasets]
     output = new_folder(config.output_dir, [reader.root for reader in readers])
     require_one_controller({reader.root: reader.controller_id for reader in readers})
-    places, dropped = _distinct_episodes(readers, config.duplicates)
+    chosen, dropped = _distinct_episodes(readers, config.duplicates)
     command = shlex.join(["egovcp-dataset", "merge", *(str(reader.root) for reader in readers)])
     provenances = [reader.origin for reader in readers]
     with DatasetWriter(output, join_provenance(provenances, command)) as writer:
-        for number, index in tqdm(places, unit="ep", delay=1):
-            episode = readers[number].read(index)
-            joined = join_metadata(episode.metadata, provenances, number)
+        for source, index in tqdm(chosen, unit="ep", delay=1):
+            episode = readers[source].read(index)
+            joined = join_metadata(episode.metadata, provenances, source)
             writer.add(replace(episode, metadata=joined))
         frames = writer.num_frames
-    result = {"episodes": len(places), "frames": frames, "dropped": dropped}
+    result = {"episodes": len(chosen), "frames": frames, "dropped": dropped}
     write_report(config.json, result)
-    echo(f"{output}: {len(places)} episodes, {frames} frames; {dropped} duplicates dropped")
+    echo(f"{output}: {len(chosen)} episodes, {frames} frames; {dropped} duplicates dropped")
 
 
 def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
@@ -138,13 +138,13 @@ def _distinct_episodes(
     """
     finder = DuplicateFinder[str]()
     distinct, dropped = [], 0
-    for number, reader in enumerate(readers):
+    for source, reader in enumerate(readers):
         for index in range(len(reader)):
             place, scenario = f"{reader.root}, episode {index}", reader.scenario(index)
             digest = reader.digest(index) or reader.read(index).digest()
             duplicate = finder.add(place, digest, scenario)
             if duplicate is None:
-                distinct.append((number, index))
+                distinct.append((source, index))
             elif not duplicate.equal:
                 raise DataError(
                     f"{place} is {scenario}, and so is {duplicate.place}, but their content "
@@ -173,17 +173,17 @@ def run_repair(config: RepairConfig) -> None:
         return
     flags = [f"--records={','.join(map(str, originals))}"] if originals else []
     command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
-    index = RecordIndex.build(root, originals, command)
+    records = RecordIndex.build(root, originals, command)
     dropped: list[DataError] = []
-    with DatasetWriter(output, index.provenance) as writer:
-        for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
+    with DatasetWriter(output, records.provenance) as writer:
+        for episode in tqdm(_valid_episodes(root, records, dropped), unit="ep", delay=1):
             writer.add(episode)
         result = _report(config, root, writer, dropped)
     echo(f"{output}: {result}")
 
 
 def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
-    """Write the sound episodes of a dataset that egovcp did not collect."""
+    """Write the valid episodes of a dataset that egovcp did not collect."""
     reader, dropped = LeRobotReader(root), list[DataError]()
     with new_dataset(output) as folder:
         writer = SubsetWriter(reader, folder)
@@ -217,25 +217,27 @@ def _report(
     return f"{kept} episodes, {frames} frames; dropped {lost} episodes ({len(dropped)} problems)"
 
 
-def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) -> Iterator[Episode]:
-    """Each sound episode once; the errors of the others are appended to ``dropped``."""
+def _valid_episodes(
+    root: Path, records: RecordIndex, dropped: list[DataError]
+) -> Iterator[Episode]:
+    """Each valid episode once; the errors of the others are appended to ``dropped``."""
     seen: set[int | None] = set()
-    finder, scenarios = DuplicateFinder[int](), ScenarioKeys(index.provenance)
+    finder, scenarios = DuplicateFinder[int](), ScenarioKeys(records.provenance)
     for found in _read_data_files(root):
         if isinstance(found, DataError):
             dropped.append(found)
             seen.add(found.episode)
             continue
-        path, number, episode = found
-        seen.add(number)
+        path, index, episode = found
+        seen.add(index)
         try:
-            sound = _validated(episode, number, index, scenarios, finder)
+            valid = _validated(episode, index, records, scenarios, finder)
         except DataError as error:
-            dropped.append(DataError.at(path, error.problem, number, error.frame))
+            dropped.append(DataError.at(path, error.problem, index, error.frame))
         else:
-            yield sound
-    for number in sorted(set(range(index.recorded)) - seen):
-        dropped.append(DataError.at(_data_path(root, number), "cannot be read", number))
+            yield valid
+    for index in sorted(set(range(records.recorded)) - seen):
+        dropped.append(DataError.at(_data_path(root, index), "cannot be read", index))
 
 
 def _read_data_files(root: Path) -> Iterator[tuple[Path, int, Episode] | DataError]:
@@ -257,11 +259,11 @@ def _read_data_files(root: Path) -> Iterator[tuple[Path, int, Episode] | DataErr
                 if isinstance(found, DataError):
                     yield found
                     continue
-                number, table = found
+                index, table = found
                 try:
-                    yield path, number, _assembled(path, table, robot)
+                    yield path, index, _assembled(path, table, robot)
                 except DataError as error:
-                    yield DataError.at(path, error.problem or str(error), number, error.frame)
+                    yield DataError.at(path, error.problem or str(error), index, error.frame)
 
 
 def _assembled(path: Path, table: pa.Table, robot: RobotSpec) -> Episode:
@@ -281,14 +283,14 @@ def _assembled(path: Path, table: pa.Table, robot: RobotSpec) -> Episode:
 
 def _validated(
     found: Episode,
-    number: int,
-    index: RecordIndex,
+    index: int,
+    records: RecordIndex,
     scenarios: ScenarioKeys,
     finder: DuplicateFinder[int],
 ) -> Episode:
     """The episode with its record; raises `DataError` with its first problem."""
     digest = found.digest()
-    record = index.find(digest, number)
+    record = records.find(digest, index)
     if record is None:
         raise DataError.without_place(
             "its content is in no record (meta/collection.json, --records): it was altered, or "
@@ -303,15 +305,15 @@ def _validated(
     for frame, problem in itertools.chain(episode.problems(), command_problems(episode)):
         raise DataError.without_place(problem, frame)
     scenario = scenarios.key(episode.task, episode.metadata)
-    duplicate = finder.add(number, digest, scenario)
+    duplicate = finder.add(index, digest, scenario)
     if duplicate is not None:
         raise DataError.without_place(duplicate.problem(scenario))
     return episode
 
 
-def _data_path(root: Path, number: int) -> Path:
+def _data_path(root: Path, index: int) -> Path:
     """The file that should hold an episode, or the data folder if that is unknown."""
     try:
-        return DatasetReader(Source(root, "")).data_path(number)
+        return DatasetReader(Source(root, "")).data_path(index)
     except (DataError, IndexError):
         return root / "data"

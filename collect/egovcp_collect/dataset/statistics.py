@@ -1,8 +1,9 @@
 """Statistics of a dataset per task: events, returns, actions, drawn parameters, depth.
 
-An *event row* is one with a nonzero term of `GOOD_TERMS` or `BAD_TERMS`. In datasets of earlier
-versions, which lack the terms of each row, it is one whose reward differs from the task's median
-reward by more than `EVENT_REWARD`.
+A *success event* is a frame with a positive value, a *failure event* one with a negative value in a
+column of `spec.REWARD_TERMS` other than `spec.ACTION_TERMS`. In datasets of earlier versions, which
+lack these columns, it is a frame whose reward differs from the task's median reward by more than
+`EVENT_REWARD`.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from egovcp.data import DatasetReader, ReturnConfig
+from egovcp.data.provenance import SOURCE
 from egovcp.errors import UsageError
-from egovcp.spec import ACTION_BOX, ACTION_NAMES, REWARD_TERMS
+from egovcp.sim.tasks import task_entries
+from egovcp.spec import ACTION_BOX, ACTION_NAMES, ACTION_TERMS, REWARD_TERMS
 from egovcp_collect.dataset.task_data import (
     DepthStatistics,
     TaskRows,
@@ -27,16 +30,15 @@ from egovcp_collect.dataset.task_data import (
     sample_episodes,
 )
 
-#: Reward terms of a success, and of a failure.
-GOOD_TERMS: Final = ("block", "pass")
-BAD_TERMS: Final = ("hit", "fall")
-_EVENT_COLUMNS: Final = [REWARD_TERMS.index(name) for name in (*GOOD_TERMS, *BAD_TERMS)]
+_EVENT_COLUMNS: Final = [i for i, name in enumerate(REWARD_TERMS) if name not in ACTION_TERMS]
+_SUCCESS_COLUMNS: Final = {"block", "pass"}  # in which a task stores its rewards; see `Task.terms`
 EVENT_REWARD: Final = 0.08  # events count 1, the costs of pose and action rate at most 0.07
 HISTOGRAM_BINS: Final = 40
 """Bins of an action's histogram, over [-1, 1]."""
 GRID_CELLS: Final = 8
 """Cells per axis of the grid over the x, y and z of one hand."""
-_NOT_DRAWN: Final = {"seed", "episode", "reward_terms", "contact_ticks"}  # in the metadata
+#: Metadata of an episode that is not drawn.
+_NOT_DRAWN: Final = {"seed", "episode", SOURCE, "reward_terms", "contact_ticks"}
 _HANDS: Final = {"left": slice(0, 3), "right": slice(3, 6)}
 
 
@@ -70,25 +72,26 @@ class EventRate:
     per_1000_ticks: float
     episodes: int
     episode_share: float  # of all episodes of the task
+    sum: float  # of the reward term over all episodes; 0 for contacts
 
 
 @dataclass(frozen=True)
 class ReturnStatistics:
-    """Monte Carlo returns of the rows that have one."""
+    """Monte Carlo returns of the frames that have one."""
 
     gamma: float
     steps: int  # horizon K, planner ticks
-    valid_share: float  # rows whose return the time limit does not cut short
+    valid_share: float  # frames whose return the time limit does not cut short
     spread: Distribution | None
-    positive_share: float  # valid rows with a positive event row within the horizon
-    negative_share: float  # valid rows with a negative event row within the horizon
+    positive_share: float  # valid frames with a success event within the horizon
+    negative_share: float  # valid frames with a failure event within the horizon
 
 
 @dataclass(frozen=True)
 class ActionStatistics:
     """Which part of the action box N actions fill, and how evenly."""
 
-    histogram: dict[str, list[int]]  # action name -> rows per bin
+    histogram: dict[str, list[int]]  # action name -> frames per bin
     uniformity: dict[str, float]
     """Action name -> overlap of its histogram p over n bins with the uniform one, sum of
     min(p_i, 1 / n): 1 is uniform, 1 / n is a single bin."""
@@ -128,14 +131,17 @@ class TaskStatistics:
 
     task: str
     episodes: int
-    steps: int
-    step_share: float  # of the dataset's steps
+    steps: int  # frames
+    step_share: float  # of the dataset's frames
     length: Distribution | None  # ticks per episode
     success_share: float
     fall_share: float
-    event_episodes: int  # in which a term of `GOOD_TERMS` or `BAD_TERMS` was not zero
-    good_episodes: int
-    bad_episodes: int
+    event_episodes: int  # with a success or failure event
+    good_episodes: int  # with a success event
+    bad_episodes: int  # with a failure event
+    has_success_events: bool
+    """Whether the data has a success event, or the installed task rewards one; False if the reward
+    has costs only."""
     events: dict[str, EventRate]
     """Rate of each reward term, and of ``touch.hands`` and ``touch.other``, ticks of contact with
     the task's object, where they were recorded."""
@@ -170,32 +176,28 @@ def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetS
         )
     rows = read_rows(reader, returns)
     samples = [sample_episodes(reader, task) for task in rows]
-    steps = reader.num_frames
-    tasks = [_task_statistics(r, s, returns, steps) for r, s in zip(rows, samples, strict=True)]
+    frames = reader.num_frames
+    tasks = [_task_statistics(r, s, returns, frames) for r, s in zip(rows, samples, strict=True)]
     return DatasetStatistics(tuple(tasks), tuple(rows), tuple(samples))
 
 
 def _task_statistics(
-    rows: TaskRows, sample: TaskSample, returns: ReturnConfig, steps: int
+    rows: TaskRows, sample: TaskSample, returns: ReturnConfig, frames: int
 ) -> TaskStatistics:
-    ticks = [_event_ticks(metadata) for metadata in rows.metadata]
-    good, bad = (
-        np.array([any(t.get(name) for name in terms) for t in ticks])
-        for terms in (GOOD_TERMS, BAD_TERMS)
-    )
-    names = dict.fromkeys(name for episode in ticks for name in episode)
+    success, failure = (np.logical_or.reduceat(event, rows.start) for event in _events(rows))
     return TaskStatistics(
         task=rows.task,
         episodes=len(rows.length),
         steps=len(rows.reward),
-        step_share=len(rows.reward) / steps,
+        step_share=len(rows.reward) / frames,
         length=Distribution.of(rows.length),
         success_share=float(rows.success.mean()),
         fall_share=float(rows.fallen.mean()),
-        event_episodes=int((good | bad).sum()),
-        good_episodes=int(good.sum()),
-        bad_episodes=int(bad.sum()),
-        events={name: _rate([t.get(name, 0) for t in ticks], len(rows.reward)) for name in names},
+        event_episodes=int((success | failure).sum()),
+        good_episodes=int(success.sum()),
+        bad_episodes=int(failure.sum()),
+        has_success_events=bool(success.any()) or _rewards_success(rows.task),
+        events=_event_rates(rows),
         reward=Distribution.of(rows.reward),
         returns=_return_statistics(rows, returns),
         action=ActionStatistics.of(rows.action),
@@ -204,47 +206,67 @@ def _task_statistics(
     )
 
 
-def _event_ticks(metadata: Mapping[str, Any]) -> dict[str, int]:
-    """Ticks of an episode in which each reward term was not zero, and with each contact."""
-    terms = metadata.get("reward_terms", {})
-    contacts = metadata.get("contact_ticks", {})
-    return {name: int(term["ticks"]) for name, term in terms.items()} | {
-        f"touch.{part}": int(ticks) for part, ticks in contacts.items()
-    }
+def _rewards_success(task: str) -> bool:
+    """Whether the task is installed and has a reward term of a success."""
+    known = {entry.name: entry.task for entry in task_entries()}.get(task)
+    return known is not None and not _SUCCESS_COLUMNS.isdisjoint(known.terms.values())
 
 
-def _rate(ticks: Sequence[int], steps: int) -> EventRate:
-    episodes = sum(t > 0 for t in ticks)
-    return EventRate(sum(ticks), 1000.0 * sum(ticks) / steps, episodes, episodes / len(ticks))
+def _event_rates(rows: TaskRows) -> dict[str, EventRate]:
+    """Name of each reward term, and ``touch.<group>`` of each contact -> rate."""
+    found: dict[str, list[tuple[int, float]]] = {}  # name -> ticks and sum in each episode
+    for metadata in rows.metadata:
+        for name, term in metadata.get("reward_terms", {}).items():
+            found.setdefault(name, []).append((int(term["ticks"]), float(term["sum"])))
+        for group, ticks in metadata.get("contact_ticks", {}).items():
+            found.setdefault(f"touch.{group}", []).append((int(ticks), 0.0))
+    rates = {}
+    for name, parts in found.items():
+        ticks, episodes = sum(t for t, _ in parts), sum(t > 0 for t, _ in parts)
+        rates[name] = EventRate(
+            ticks,
+            1000.0 * ticks / len(rows.reward),
+            episodes,
+            episodes / len(rows.metadata),
+            sum(s for _, s in parts),
+        )
+    return rates
 
 
 def _return_statistics(rows: TaskRows, config: ReturnConfig) -> ReturnStatistics:
     valid = rows.mc_valid
-    good, bad = events_ahead(rows, config.steps)
+    success, failure = events_ahead(rows, config.steps)
     return ReturnStatistics(
         gamma=config.gamma,
         steps=config.steps,
         valid_share=float(valid.mean()),
         spread=Distribution.of(rows.mc_return[valid]),
-        positive_share=float(good[valid].mean()) if valid.any() else 0.0,
-        negative_share=float(bad[valid].mean()) if valid.any() else 0.0,
+        positive_share=float(success[valid].mean()) if valid.any() else 0.0,
+        negative_share=float(failure[valid].mean()) if valid.any() else 0.0,
     )
 
 
 def events_ahead(rows: TaskRows, steps: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(N,) and (N,): whether a positive, or negative, event row is among the next ``steps`` rows of
-    the episode, including the row itself."""
-    events, least = rows.reward_terms[:, _EVENT_COLUMNS], 0.0
-    if not rows.reward_terms.any():  # not recorded
-        events, least = (rows.reward - np.median(rows.reward))[:, None], EVENT_REWARD
+    """(N,) and (N,): whether a success event, or a failure event, is among the next ``steps``
+    frames of the episode, including the frame itself."""
     end = np.repeat(rows.start + rows.length, rows.length)
-    here = np.arange(len(events))
+    here = np.arange(len(rows.reward))
 
     def ahead(event: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        before = np.concatenate([[0], event.any(axis=1).cumsum()])
+        before = np.concatenate([[0], event.cumsum()])
         return np.asarray(before[np.minimum(here + steps, end)] > before[here])
 
-    return ahead(events > least), ahead(events < -least)
+    success, failure = _events(rows)
+    return ahead(success), ahead(failure)
+
+
+def _events(rows: TaskRows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) and (N,): whether a frame has a success event, and a failure event."""
+    values, threshold = rows.reward_terms[:, _EVENT_COLUMNS], 0.0
+    if not rows.reward_terms.any():  # not recorded
+        values, threshold = (rows.reward - np.median(rows.reward))[:, None], EVENT_REWARD
+    success, failure = values > threshold, values < -threshold
+    return np.any(success, axis=1), np.any(failure, axis=1)
 
 
 def drawn_parameters(metadata: Sequence[Mapping[str, Any]]) -> dict[str, Distribution]:

@@ -39,7 +39,7 @@ type Spans = Mapping[int, Mapping[str, VideoSpan]]
 
 
 @dataclass(frozen=True)
-class SoundEpisode:
+class ValidEpisode:
     """An episode without a problem."""
 
     row: EpisodeRow
@@ -49,12 +49,11 @@ class SoundEpisode:
     """Its numbers and strings, (T, n) of each feature."""
 
 
-def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
-    """Each sound episode once, in the order of the data files, and the problems of the others.
+def scan_episodes(reader: LeRobotReader) -> Iterator[ValidEpisode | DataError]:
+    """Each valid episode once, in the order of the data files, and the problems of the others.
 
-    What the tables lack is taken from the data: ``reader.tasks`` from the episodes that name one
-    task, and the place of an unlisted episode in the videos if these hold the frames of all
-    episodes and no others.
+    Missing metadata is rebuilt: task names from the episodes with exactly one task; the video
+    position of an unlisted episode if the videos hold exactly the frames of all episodes.
     """
     check = LeRobotCheck(reader, every=True)
     columns = [k for k, f in reader.features.items() if f.dtype != "video"]
@@ -82,8 +81,10 @@ def scan_episodes(reader: LeRobotReader) -> Iterator[SoundEpisode | DataError]:
 
 def _examine(
     check: LeRobotCheck, spans: Callable[[], Spans], path: Path, number: int, table: pa.Table
-) -> Iterator[SoundEpisode | DataError]:
-    row = check.by_number.get(number) or EpisodeRow(path, number, 0, 0, 0, path)
+) -> Iterator[ValidEpisode | DataError]:
+    row = check.by_number.get(number) or EpisodeRow(
+        table_path=path, index=number, length=0, start=0, end=0, data_path=path
+    )
     if check.reader.keys("video"):
         row = replace(row, videos=row.videos or spans().get(number, {}))
     if missing := sorted(set(check.reader.keys("video")) - set(row.videos)):
@@ -95,11 +96,11 @@ def _examine(
         if isinstance(found, DataError):
             yield found
         else:
-            yield SoundEpisode(replace(row, data_path=path), table, found)
+            yield ValidEpisode(replace(row, data_path=path), table, found)
 
 
 def _named_tasks(reader: LeRobotReader) -> dict[int, str]:
-    """Task index -> task, from the episodes that name one."""
+    """Task index -> task, from the episodes with exactly one task."""
     named = {row.index: row.tasks[0] for row in reader.rows if len(row.tasks) == 1}
     tasks: dict[int, str] = {}
     for path in reader.data_files:
@@ -137,7 +138,7 @@ def _rebuilt_spans(reader: LeRobotReader) -> Spans:
 
 
 class SubsetWriter:
-    """Writes sound episodes, in the order of the data files of their dataset, to the new folder
+    """Writes valid episodes, in the order of the data files of their dataset, to the new folder
     ``folder``; call `finish` at the end."""
 
     def __init__(self, reader: LeRobotReader, folder: Path) -> None:
@@ -153,7 +154,7 @@ class SubsetWriter:
     def num_episodes(self) -> int:
         return len(self._rows)
 
-    def add(self, episode: SoundEpisode) -> None:
+    def add(self, episode: ValidEpisode) -> None:
         """Append an episode."""
         number, count = self.num_episodes, len(episode.table)
         table = episode.table
@@ -186,7 +187,7 @@ class SubsetWriter:
         info = dict(reader.info)
         totals = {"total_episodes": count, "total_frames": self.num_frames}
         info |= {**totals, "total_tasks": len(tasks), "splits": {"train": f"0:{count}"}}
-        total = {key: aggregate_named(parts) for key, parts in self._stats.items() if parts}
+        total = {key: aggregate_named(parts) for key, parts in self._stats.items()}
         counts = {key: sum(n for n, _ in self._stats[key]) for key in total}
         stats = {
             key: {**{name: v.tolist() for name, v in value.items()}, "count": [counts[key]]}
@@ -212,7 +213,7 @@ class SubsetWriter:
         chunk, file = divmod(number, size if type(size) is int and size > 0 else schema.CHUNK_FILES)
         return str(self._reader.info["data_path"]).format(chunk_index=chunk, file_index=file)
 
-    def _row(self, episode: SoundEpisode, number: int, count: int) -> dict[str, Any]:
+    def _row(self, episode: ValidEpisode, number: int, count: int) -> dict[str, Any]:
         """Its row in ``meta/episodes``."""
         reader, old = self._reader, episode.row
         tasks = dict.fromkeys(episode.values["task_index"][:, 0].tolist())
@@ -242,7 +243,7 @@ class SubsetWriter:
         return row
 
     def _statistics(
-        self, episode: SoundEpisode, feature: Feature, number: int
+        self, episode: ValidEpisode, feature: Feature, number: int
     ) -> tuple[int, Statistics]:
         """Number of frames, and statistics; none of strings. Those of cameras are as recorded, or
         of some frames."""
@@ -259,7 +260,7 @@ class SubsetWriter:
         if key in ("index", "episode_index"):
             first, step = (number, 0) if key == "episode_index" else (self.num_frames, 1)
             values = first + step * np.arange(count)[:, None]
-        values = values.reshape(-1, feature.shape[-1])
+        values = values.reshape(-1, feature.shape[-1])  # LeRobot reduces all axes but the last
         return count, _with_quantiles(values)
 
 
@@ -270,7 +271,7 @@ def _with_quantiles(values: NDArray[Any]) -> Statistics:
 
 
 def _camera_statistics(
-    episode: SoundEpisode, feature: Feature, fps: float
+    episode: ValidEpisode, feature: Feature, fps: float
 ) -> tuple[int, Statistics]:
     """Statistics per channel of up to 20 frames, (C, 1, 1) each, of colours in [0, 1]."""
     count = len(episode.table)
@@ -308,7 +309,7 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
     episodes and frames.
 
     Raises:
-        DataError: one of them has a problem, or the numbers are not 0 to N - 1.
+        DataError: one of them has a problem, or the dataset's episodes are not numbered 0 to N - 1.
     """
     if [row.index for row in reader.rows] != list(range(len(reader.rows))):
         problem = "its episodes are not numbered from 0 without gaps"
@@ -319,7 +320,7 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
         for found in scan_episodes(reader):
             if isinstance(found, DataError):
                 if found.episode is None or found.episode in wanted:
-                    raise DataError(f"{found}; `egovcp-dataset repair` keeps what is sound")
+                    raise DataError(f"{found}; `egovcp-dataset repair` keeps the valid episodes")
             elif found.row.index in wanted:
                 writer.add(found)
         writer.finish()

@@ -52,7 +52,7 @@ class TaskRows:
 
 
 def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
-    """The rows of each task in the dataset, in the order of their first episodes; 74 bytes per row.
+    """The rows of each task in the dataset, in the order of their first episodes.
 
     Raises:
         DataError: a file is damaged.

@@ -22,11 +22,13 @@ from egovcp.terminal import echo
 
 @dataclass(frozen=True)
 class VizConfig:
-    """Show an episode in Rerun: depth, the robot's pose, hand targets, actions, rewards, state.
+    """Write an episode as a Rerun or MCAP recording.
+
+    It shows depth, the robot's pose, hand targets, actions, rewards and state.
 
     The pelvis pose is not part of a dataset: the robot is drawn at the origin, at its commanded
-    height, tilted as its IMU measured. Of a LeRobot v3 dataset that egovcp did not collect, it
-    shows the images and a curve of every number.
+    height, tilted as its IMU measured. Of a LeRobot v3 dataset that egovcp did not collect, the
+    recording shows the images and a curve of every number.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)

@@ -95,7 +95,8 @@ class ControlProcess:
         self._loop.pilot.add_events([event])
 
     def run(self, stopping: Sequence[int]) -> None:
-        """Run until a quit command, or until ``stopping`` is not empty."""
+        """Run until a quit command, until ``stopping`` is not empty, or until the robot is damped
+        and the planner's process has been gone for 2 s."""
         rate = FixedRate(CONTROLLER_HZ, MonotonicClock())
         rate.start()
         while not stopping and self._orphaned < _ORPHAN_TICKS:

@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.errors import EgovcpError, SafetyStop
+from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.log.tick import Tick
@@ -20,7 +20,12 @@ from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.operators import open_operator
-from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
+from egovcp_deploy.live.planner_loop import (
+    START_S,
+    LiveSummary,
+    PlannerLoop,
+    describe_failure,
+)
 from egovcp_deploy.live.processes import running_control, stop_control
 from egovcp_deploy.options import make_output_dir
 from egovcp_deploy.pilot.planner import PlannerRunner, backend_of
@@ -62,12 +67,19 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
             loop = PlannerLoop(runner, control.link, operator, sink, clock, process.is_alive, stays)
             watchdog.expected = lambda: loop.quitting
             summary = loop.run(lambda tick: _show(bar, tick))
+            silent = not (summary.ticks or summary.failure or loop.quitting)
+            died = not process.is_alive()
             stop_control(process, loop)
             watchdog.join_if_ended()
+            if silent and died:
+                control.check_alive()
+            if silent:
+                raise EnvironmentFailure(
+                    f"no observation arrived within {START_S:g} s; egovcp-deploy --dry_run=true "
+                    "checks robot and camera"
+                )
             if watchdog.acted and summary.ticks:
                 summary.damped = f"the control process died (exit code {process.exitcode})"
-            elif not summary.ticks and summary.failure is None:
-                control.check_alive()
     except EgovcpError:
         for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
             path.unlink()
@@ -104,10 +116,10 @@ def _raise_failure(summary: LiveSummary, folder: Path) -> None:
     """Raise what ended the run early, if anything."""
     if summary.damped:
         raise SafetyStop(
-            f"the motors were damped: {summary.damped}. The log is in {folder}; "
-            "find the cause before the next run"
+            f"the motors were damped: {summary.damped}. The log is in {folder}; look into it "
+            "before the next run"
         ) from summary.failure
-    if isinstance(summary.failure, EgovcpError):
+    if isinstance(summary.failure, EgovcpError) and not summary.held:
         raise summary.failure
     if summary.failure is not None:
         raise SafetyStop(

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _START_S: Final = 120.0  # for the operator to bring the robot to RUN
 _OBSERVATION_S: Final = 0.5  # longest wait for an observation; one comes every 40 ms
 _END_S: Final = 5.0
-_PLAN_TICKS: Final = 4  # for which an action is repeated if the next one is late
+_PLAN_TICKS: Final = 4  # that an action covers, its own included, if the next one is late
 
 
 class ExternalPolicyRobot:
@@ -102,11 +102,11 @@ class ExternalPolicyRobot:
         return self._newest
 
     def send(self, action: NDArray[np.floating]) -> Array:
-        """Send an action (7,), box units; returns it as rate limited by the robot, (7,). Raises
-        `UsageError` if it is not seven finite numbers."""
+        """Send an action (7,), clipped to [-1, 1]; returns it as rate limited by the robot, (7,).
+        Raises `UsageError` if it is not seven finite numbers."""
         wanted = np.asarray(action, np.float64)
         if wanted.shape != (ACTION_DIM,) or not np.isfinite(wanted).all():
-            raise UsageError(f"an action is {ACTION_DIM} numbers in [-1, 1], found {wanted}")
+            raise UsageError(f"an action is {ACTION_DIM} finite numbers, found {wanted}")
         assert self._newest is not None, "connect first"
         actions = np.repeat(wanted[None, None].astype(np.float32), _PLAN_TICKS, axis=1)
         plan = PlanMessage(self._newest.tick, PolicyStep(actions[:, 0], actions), 0.0)

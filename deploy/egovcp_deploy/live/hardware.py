@@ -28,12 +28,12 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """The robot."""
+    """The robot: simulated, real or recorded; its connection, camera and safety limits."""
 
     type: Literal["sim", "unitree_g1", "replay"] = "sim"
-    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
-    behind LeRobot's bridge, on the wall clock. replay: recorded observations; the policy plans
-    again, and nothing is driven."""
+    """sim: the simulated G1, in lock-step with the planner; unitree_g1: a G1, or egovcp-fake-g1,
+    behind LeRobot's bridge, on the wall clock; replay: recorded observations, from which the policy
+    plans again, and nothing is driven."""
     recordings: str = ""
     """For replay: an MCAP file, or a folder of them."""
     controller: str = "walk"

@@ -32,9 +32,10 @@ from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 
 _WAIT_S: Final = 0.01
 _AFTER_DAMP_S: Final = 1.0  # still recorded once the motors are damped
-_START_S: Final = 60.0  # for the control process to send its first observation
+START_S: Final = 60.0  # for the control process to send its first observation
 _DECODING_DECAY: Final = 0.98  # of the expected decoding time, per image that is not decoded
 _NS: Final = 1e9
+_TOWARDS_RUN: Final = (OperatorRequest.STAND, OperatorRequest.ARM, OperatorRequest.RUN)
 
 
 @dataclass
@@ -43,7 +44,7 @@ class LiveSummary:
 
     ticks: int = 0
     planned: int = 0  # ticks whose plan was made from their own observation
-    skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
+    skipped: int = 0  # observations that the policy ignored, see `SKIPPED`
     late: int = 0  # plans that came after their tick
     running: int = 0  # ticks in RUN
     held: int = 0  # ticks in HOLD
@@ -62,8 +63,8 @@ class PlannerLoop:
         sink: the log; it must not block.
         clock: monotonic, the one that stamps the observations.
         control_alive: whether the control process runs.
-        stays: whether a robot held after Ctrl-C stands until the second Ctrl-C, as a real one must
-            that is not on its gantry yet.
+        stays: after the first Ctrl-C the robot stands until the second one. Else the run ends
+            after `EASE_S`, and the motors are damped.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class PlannerLoop:
         self._stays = stays
         self.summary = LiveSummary()
         self.interrupts: list[int] = []  # SIGINT as often as received
-        self.quitting = False  # whether the control process has been sent a quit command
+        self.quitting = False  # whether the control process is expected to end
         self._mode = ""
         self._events: list[str] = []  # of this process, for the next tick
         self._end_reason = ""
@@ -97,7 +98,7 @@ class PlannerLoop:
         started_ns, self._on_tick = self._clock.now_ns(), on_tick
         with stop_on_signal(signals=(signal.SIGINT,), interrupt=False) as self.interrupts:
             while not self.quitting and self._control_alive():
-                if self._begin_ns is None and self._clock.now_ns() - started_ns > _START_S * _NS:
+                if self._begin_ns is None and self._clock.now_ns() - started_ns > START_S * _NS:
                     break
                 try:
                     self._step()
@@ -165,7 +166,8 @@ class PlannerLoop:
 
     # --- the log -------------------------------------------------------------------------
     def _log(self, observation: ObservationMessage, plan: PlanMessage | None) -> None:
-        """Log the tick before: the next observation holds the action that was sent in it."""
+        """Log the previous tick: the action that was sent in it arrives with the next observation.
+        If that was lost, the tick is not logged, because its action is unknown."""
         before, self._pending = self._pending, (observation, plan)
         if before is not None and before[0].tick == observation.tick - 1:
             self._write(*before, observation)
@@ -228,7 +230,8 @@ class PlannerLoop:
             if self.summary.failure is None:
                 raise  # else the operator's failure is not the first one, which is reported
         for command in commands:
-            self._send(command, "by the operator")
+            if not (self.interrupts and command.request in _TOWARDS_RUN):
+                self._send(command, "by the operator")
         for command in self._interrupt_commands(len(self.interrupts), now_ns):
             self._send(command, "interrupted")
         if self._damped_ns is not None and now_ns - self._damped_ns > _AFTER_DAMP_S * _NS:
@@ -237,7 +240,7 @@ class PlannerLoop:
             self._send(OperatorCommand(quit=True), "the planner failed before the robot stood")
 
     def _interrupt_commands(self, interrupts: int, now_ns: int) -> list[OperatorCommand]:
-        """First Ctrl-C: hold, ease the hands, and end the run where that is safe. Second: damp."""
+        """First Ctrl-C: hold, ease the hands, and end the run unless ``stays``. Second: damp."""
         if not interrupts:
             return []
         if interrupts >= 2:

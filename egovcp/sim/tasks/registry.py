@@ -132,7 +132,9 @@ def _missing_of_robot(task: type[BaseTask]) -> list[str]:
     from egovcp.sim.tasks.robot_task import RobotTask
 
     if not issubclass(task, RobotTask):
-        return []
+        if task.robot_spec().is_g1:
+            return []
+        raise ValueError("its robot is not the G1; derive it from egovcp.sim.tasks.RobotTask")
     robot = getattr(task, "robot_class", None)
     if robot is None:
         return ["robot_class"]

@@ -14,6 +14,7 @@ from egovcp_experiment.grid import ALL, MIXED, REFERENCES, Grid
 from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
 
 _LATENT_EPISODES: Final = 16  # per task
+_REFERENCES: Final = (*REFERENCES, "constant")
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
@@ -30,8 +31,8 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             "mixed": grid.plays(task, MIXED, trained_on=ALL),
         }
         scores = results.all_scores(records, plays, task)
-        cell = grid.references(task)
-        references = results.controller_scores(records, cell, task, REFERENCES)
+        cell = grid.references(task, f"references-{task}", controllers=_REFERENCES)
+        references = results.controller_scores(records, cell, task, _REFERENCES)
         page.figures[task] = results.figures_of({**scores, **references})
         if scores:
             tables.append(results.comparison(task, {**scores, **references}, "single"))

@@ -228,7 +228,7 @@ def _introduction(config: ExperimentConfig) -> str:
     return (
         f"All models were trained for {config.train.compared_steps} gradient steps on the same "
         "data with a head for rewards (`--policy.loss.reward=1`), and differ in the flags of their "
-        "row only. Ours, Rew-MPC and TD-MPC with Q by Monte Carlo plan with the same "
+        "row only. Ours, Rew-MPC and TD-MPC with Q as in ours plan with the same "
         f"model. All rows play the same scenarios. {chance}"
     )
 

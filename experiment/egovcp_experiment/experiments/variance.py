@@ -9,22 +9,23 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.eval_scores import EvalScores, signed_range
+from egovcp.spec import ACTION_ETA
 from egovcp_experiment import results
 from egovcp_experiment.grid import Grid, parse_flags
 from egovcp_experiment.report import ExperimentReport, Plot, Table, draw
 from egovcp_experiment.studies.residuals import STEPS
 
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
-#: The random walk of `egovcp-collect` by default, as flags; that of its preset `paper` is the
-#: default of the study.
+#: The random walk of `egovcp-collect` by default and of its preset `paper`, as flags.
 _COLLECT_WALK: Final = {"eta": "1.0", "step_ticks": "[5,15]", "boundary": "reflect"}
+_PAPER_WALK: Final = {"eta": str(ACTION_ETA), "step_ticks": "[1,1]", "boundary": "reflect"}
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     given = parse_flags(config.data.flags)
-    walk = {} if given.get("preset") == "paper" else _COLLECT_WALK
+    walk = _PAPER_WALK if given.get("preset") == "paper" else _COLLECT_WALK
     walk = walk | {name: given[name] for name in _COLLECT_WALK if name in given}
     page = ExperimentReport(
         "Variance: do the errors of Q along a plan average out?",

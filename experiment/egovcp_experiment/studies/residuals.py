@@ -4,8 +4,9 @@
 
 Q^ is the model's value along an imagined plan. Q is the mean return of the data's random walk from
 there: the simulator is reset to the same state, follows the plan up to a_k, and continues with
-several random walks. If the data's walk rests between its steps, the remaining rest is drawn, too.
-The sampling variance of the mean is subtracted; errors of different k use different walks.
+several random walks. With step_ticks > 1, the time to the walk's next step is sampled, too. The
+sampling variance of the mean is subtracted; errors of different k use different walks. So e_k is an
+error of Q only if Q was trained on such returns: with q_target=mc, on data of the same walk.
 
     E[(J_N - J^_N)^2] = 1/N^2 sum_ij Cov[e_i, e_j] + bias^2
     V_ub = (N + rho (N^2 - N)) / N^2 sigma_max^2
@@ -34,7 +35,8 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM, ACTION_ETA
+from egovcp.spec import ACTION_DIM
+from egovcp.terminal import echo
 from egovcp_experiment.studies import study
 
 STEPS: Final = 6  # the longest horizon of table I
@@ -44,16 +46,39 @@ _AFTER: Final = {"ball": (-5, 4, 8, 12, 16), "wall": (-5, 1, 4, 8), "arch": (-2,
 
 @dataclass(frozen=True)
 class ResidualsConfig(study.SimStudyConfig):
-    """Errors of Q along plans, one plan of each kind per episode."""
+    """Q along plans minus simulated returns, for one plan of each kind per episode: errors of Q
+    only for a policy trained with q_target=mc on data of the same walk."""
 
     branches: int = bounded(12, least=2)
     """Random walks per step of a plan; their mean return is what Q is compared with."""
-    eta: float = bounded(ACTION_ETA, above=0, most=2)
-    """Step size of the data's random walk, as in egovcp-collect."""
-    step_ticks: tuple[int, int] = bounded((1, 1), least=1)
-    """Shortest and longest time between two steps of the walk, planner ticks."""
+    eta: float = bounded(1.0, above=0, most=2)
+    """Largest step of the data's random walk, action box units; default of egovcp-collect."""
+    step_ticks: tuple[int, int] = bounded((5, 15), least=1, most=100_000)
+    """Shortest and longest interval between steps of the walk, planner ticks."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box."""
+
+    def check(self) -> None:
+        """See `StudyConfig.check`."""
+        super().check()
+        shortest, longest = self.step_ticks
+        if shortest > longest:
+            raise UsageError(
+                f"--step_ticks={[shortest, longest]}: expected 1 <= shortest <= longest, planner "
+                "ticks"
+            )
+
+    def load(self) -> Artifact:
+        """As `SimStudyConfig.load`; warns if Q was not trained on returns."""
+        artifact = super().load()
+        target = artifact.world_model.config.loss.q_target
+        if target != "mc":
+            echo(
+                f"warning: Q of {artifact.path} was trained with q_target={target}, not on returns "
+                "(mc): its differences from returns of random walks are not errors",
+                error=True,
+            )
+        return artifact
 
 
 @dataclass
@@ -70,7 +95,7 @@ class _Start:
 
 
 def _starts(artifact: Artifact, config: ResidualsConfig) -> list[_Start]:
-    """One start per episode."""
+    """At most one start per episode."""
     after, eta = _AFTER[config.task], artifact.planner.eta
     generator = torch.Generator().manual_seed(config.seed)
     longest = replace(artifact, planner=replace(artifact.planner, horizon=STEPS))
@@ -86,7 +111,7 @@ def _starts(artifact: Artifact, config: ResidualsConfig) -> list[_Start]:
                 deltas = 2 * torch.rand(STEPS, ACTION_DIM, generator=generator) - 1
                 executed = torch.as_tensor(last, dtype=torch.float32)
                 plans = {
-                    "planner": step.plan.plan[row].astype(np.float64),
+                    "planner": step.decision.plan[row].astype(np.float64),
                     "random": random_walk(executed, deltas, eta).double().numpy(),
                 }
                 carry = step.carry.row(row)
@@ -172,7 +197,7 @@ def _branches(
 
 
 def analysis(value: Array, short: Array, whole: Array) -> dict[str, Any]:
-    """Variances, correlations, bounds and biases; needs at least three plans.
+    """Variances, correlations, bounds and biases; of fewer than three plans only their number.
 
     Args:
         value: (P, K) Q^ along P plans of K steps.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import batched
@@ -19,6 +20,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
 from egovcp.model import Carry
+from egovcp.outputs import require_writable
 from egovcp.plan import PolicyStep
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.robot.controllers import make_controller
@@ -43,6 +45,26 @@ class StudyConfig:
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the policy's planner."""
 
+    @property
+    def folder(self) -> Path:
+        """The folder for the result."""
+        return Path(os.path.expanduser(self.output_dir))
+
+    def check(self) -> None:
+        """Check the options before the work; `make_main` calls it.
+
+        Raises:
+            UsageError: no folder is named, or it holds a result; or invalid values.
+            EnvironmentFailure: the folder cannot be written.
+        """
+        if not self.output_dir:
+            raise UsageError("--output_dir is missing; name a new folder")
+        if (self.folder / RESULT).exists():
+            raise UsageError(
+                f"--output_dir={self.output_dir} holds a result already; name a new folder"
+            )
+        require_writable(self.folder)
+
     def load(self) -> Artifact:
         """The policy with the changed planner.
 
@@ -54,18 +76,9 @@ class StudyConfig:
         return load_policy(self.policy, self.planner)
 
     def write(self, figures: Mapping[str, Any]) -> None:
-        """Write the result into the new folder.
-
-        Raises:
-            UsageError: no folder is named, or it holds a result.
-        """
-        if not self.output_dir:
-            raise UsageError("--output_dir is missing; name a new folder")
-        folder = Path(self.output_dir)
-        if (folder / RESULT).exists():
-            raise UsageError(f"{folder} holds a result already; name a new folder")
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / RESULT, figures)
+        """Write the result into the folder."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / RESULT, figures)
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,7 @@ class SimStudyConfig(StudyConfig):
     """Task to play."""
     episodes: int = bounded(16, least=1)
     """Number of scenarios."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of the scenarios."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation."""
@@ -104,9 +117,13 @@ def make_main[C: StudyConfig](
 ) -> Callable[..., int]:
     """The `main` of a study's module, which returns the exit code."""
 
+    def run(options: C) -> None:
+        options.check()
+        measure(options)
+
     def main(argv: Sequence[str] | None = None) -> int:
         prog = f"python -m egovcp_experiment.studies.{name}"
-        return run_command(config, measure, argv, prog=prog)
+        return run_command(config, run, argv, prog=prog)
 
     return main
 
@@ -128,7 +145,7 @@ class PlayedStep:
     live: list[int]
     """Rows whose episode was not over."""
     observation: Observation
-    plan: PolicyStep
+    decision: PolicyStep
     result: StepResult
 
 
@@ -143,11 +160,11 @@ def play_episodes(
             policy = artifact.make_policy(len(group), config.seed)
             observation = env.reset(group)
             while not env.done.all():
-                plan = policy.act(observation.depth, observation.state)
+                decision = policy.act(observation.depth, observation.state)
                 live = [int(row) for row in np.flatnonzero(~env.done)]
                 before = (env.privileged_state(), policy.carry.map(torch.clone), np.array(env.tick))
-                result = env.step(plan.action)
+                result = env.step(decision.action)
                 policy.advance(result.sent_action)
-                yield PlayedStep(group, env, *before, live, observation, plan, result)
+                yield PlayedStep(group, env, *before, live, observation, decision, result)
                 observation = result.observation
             bar.update(len(group))

@@ -57,7 +57,7 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
             if name and (episode, name) not in maps:
                 hand: Literal["left", "right"] = "left" if facts["aim_lateral"] > 0 else "right"
                 grid, carry = hand_grid(hand), step.carry.row(row)
-                action = torch.as_tensor(step.plan.action[row : row + 1]).to(carry.h)
+                action = torch.as_tensor(step.decision.action[row : row + 1]).to(carry.h)
                 values = value_map(artifact.world_model, carry, action, hand, grid)[0]
                 found = values.double().cpu().numpy()
                 z, x = np.unravel_index(int(found.argmax()), found.shape)

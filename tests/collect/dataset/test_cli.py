@@ -5,7 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from egovcp.data import Provenance
 from egovcp_collect.dataset.cli import COMMANDS, main
+
+from .conftest import write
 
 pytestmark = pytest.mark.usefixtures("no_network")
 
@@ -78,6 +81,21 @@ def test_a_folder_is_preferred_to_an_id_of_the_same_name(
     monkeypatch.chdir(sound.parent.parent)
     assert main(["info", f"{sound.parent.name}/{sound.name}"]) == 0
     assert str(sound) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("seed", "shown"), [(None, "none"), (6, "several")])
+def test_info_shows_no_or_several_seeds(
+    seed: int | None, shown: str, sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write(tmp_path / "one", [6], Provenance("stance-1", seed))
+    if seed is not None:
+        merged = tmp_path / "merged"
+        assert main(["merge", str(sound), str(root), f"--output_dir={merged}"]) == 0
+        root = merged
+    capsys.readouterr()
+    assert main(["info", str(root)]) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("seed")]
+    assert line.split()[1:] == [shown]
 
 
 def test_info_reports_counts_and_provenance(sound: Path, tmp_path: Path) -> None:

@@ -5,13 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
 from egovcp import packages
 from egovcp.data import ReturnConfig
+from egovcp.data.lerobot import LeRobotReader
+from egovcp.errors import DataError
 from egovcp_collect.dataset.cli import main
-from egovcp_collect.dataset.coverage import CoverageLimits, assess, summary
+from egovcp_collect.dataset.coverage import CoverageLimits, _feature_statistics, assess, summary
 from egovcp_collect.dataset.statistics import (
     ActionStatistics,
     DatasetStatistics,
@@ -83,6 +86,14 @@ def test_a_missing_matplotlib_is_reported_before_reading(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_missing_column_is_named(tmp_path: Path) -> None:
+    reader = write_scenes(tmp_path / "one", [scene(0, length=4, time_limit=4)])
+    path = reader.data_path(0)
+    pq.write_table(pq.read_table(path, partitioning=None).drop_columns(["action"]), path)
+    with pytest.raises(DataError, match="column action is missing"):
+        _feature_statistics(LeRobotReader(reader.root))
+
+
 def test_no_dataset_is_a_data_error(tmp_path: Path) -> None:
     assert main(["coverage", f"--dataset.root={tmp_path / 'none'}"]) == 3
 
@@ -92,7 +103,9 @@ def test_returns_over_no_ticks_are_refused(root: Path, capsys: pytest.CaptureFix
     assert "--returns.steps=0" in capsys.readouterr().err
 
 
-EASY = CoverageLimits(event_episodes=1, good_rows=0.0, valid_rows=0.0, occupied=0.0, uniformity=0.0)
+EASY = CoverageLimits(
+    event_episodes=1, event_frames=0.0, valid_frames=0.0, occupied=0.0, uniformity=0.0
+)
 
 
 @pytest.fixture(scope="module")
@@ -127,12 +140,23 @@ def test_rare_events_fail(found: DatasetStatistics) -> None:
 @pytest.mark.parametrize(
     ("field", "counts"),
     [
-        ("good_episodes", "0 episodes with a good event, 1 with a bad one"),
-        ("bad_episodes", "1 episodes with a good event, 0 with a bad one"),
+        ("good_episodes", "0 episodes with a success event, 1 with a failure event"),
+        ("bad_episodes", "1 episodes with a success event, 0 with a failure event"),
     ],
 )
 def test_a_missing_kind_of_event_fails(found: DatasetStatistics, field: str, counts: str) -> None:
     assert failed(found, **{field: 0}) == [f"{counts}; expected at least one of each"]
+
+
+def test_a_task_with_costs_only_needs_no_success_event(found: DatasetStatistics) -> None:
+    costs = {"good_episodes": 0, "has_success_events": False}
+    returns = replace(found.tasks[0].returns, positive_share=0.0, negative_share=0.1)
+    limits = replace(EASY, event_frames=0.01)
+    assert failed(found, limits, **costs, returns=returns) == []
+    (text,) = failed(found, limits, **costs, returns=replace(returns, negative_share=0.0))
+    assert text.endswith("expected at least 1% with a failure event")
+    (text,) = failed(found, limits, **costs, returns=returns, bad_episodes=0)
+    assert text.endswith("expected at least one with a failure event")
 
 
 @pytest.mark.parametrize(("share", "advice"), [(0.99, "harder"), (0.0, "easier"), (1.0, "harder")])
@@ -148,11 +172,11 @@ def test_uninformative_returns_fail(found: DatasetStatistics) -> None:
     (text,) = failed(found, returns=replace(r, spread=replace(r.spread, std=0.001)))
     assert "+- 0.001; expected a standard deviation of at least 0.02" in text
     none = replace(r, valid_share=0.0, spread=None)
-    for limits in (EASY, replace(EASY, valid_rows=0.2)):
+    for limits in (EASY, replace(EASY, valid_frames=0.2)):
         (text,) = failed(found, limits, returns=none)
-        assert text.startswith("0% of the rows have a return over ")
-    (text,) = failed(found, replace(EASY, good_rows=0.5))
-    assert text.endswith("a cost event; expected at least 50% with a reward event")
+        assert text.startswith("0% of the frames have a return over ")
+    (text,) = failed(found, replace(EASY, event_frames=0.5))
+    assert text.endswith("a failure event; expected at least 50% with a success event")
 
 
 def test_narrow_actions_fail(found: DatasetStatistics) -> None:
@@ -174,5 +198,5 @@ def test_a_rare_task_fails(found: DatasetStatistics) -> None:
     rest = replace(found.tasks[0], task="wall", step_share=0.9)
     few = replace(found, tasks=(replace(found.tasks[0], step_share=0.1), rest))
     texts = [(f.task, f.text) for f in assess(few, EASY) if not f.passed]
-    text = "10% of the steps; expected at least 25%: collect more of this task"
+    text = "10% of the frames; expected at least 25%: collect more of this task"
     assert texts == [("ball", text)]

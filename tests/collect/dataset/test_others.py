@@ -64,7 +64,7 @@ def test_coverage_names_constant_values(
     still = lambda values: values.__setitem__(slice(None), [[1.0, v[1]] for v in values])  # noqa: E731
     rows_of(d.DATA, action=still)(root)
     assert main(["coverage", str(root)]) == 0
-    assert "action[0] (pan) is always 1: normalising divides" in capsys.readouterr().out
+    assert "action[0] (pan) is always 1: it carries no information" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,7 @@ def test_own_datasets_are_split_with_their_records(sound: Path, tmp_path: Path) 
         ["--episodes=0:4"],
         ["--splits={a: 0.9, b: 0.9}"],
         ["--splits={../a: 1}"],
+        ["--splits={a: 0.9, b: 0.01}"],
     ],
 )
 def test_impossible_edits_are_refused(
@@ -113,6 +114,22 @@ def test_impossible_edits_are_refused(
     output = tmp_path / "out"
     assert main([command, str(others["arm"]), *flags, f"--output_dir={output}"]) == 2
     assert not output.exists()
+
+
+def test_split_writes_nothing_if_a_later_folder_is_in_use(sound: Path, tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "mine").touch()
+    splits = ["split", str(sound), "--splits={a: 0.5, b: 0.5}", f"--output_dir={tmp_path}"]
+    assert main(splits) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+
+
+def test_plots_of_other_datasets_are_refused(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["coverage", str(others["arm"]), f"--output_dir={tmp_path / 'plots'}"]) == 2
+    assert "plots are of those only" in capsys.readouterr().err
+    assert not (tmp_path / "plots").exists()
 
 
 def test_a_gap_in_the_numbers_is_refused_and_repaired(

@@ -156,10 +156,13 @@ def test_damage_is_named(
     assert text in capsys.readouterr().out
 
 
-def test_an_episode_is_read_beside_a_damaged_one(others: dict[str, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("statistics", [True, False])
+def test_an_episode_is_read_beside_a_damaged_one(
+    statistics: bool, others: dict[str, Path], tmp_path: Path
+) -> None:
     root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
     path, table = root / d.DATA, pq.read_table(root / d.DATA)
-    with pq.ParquetWriter(path, table.schema) as writer:
+    with pq.ParquetWriter(path, table.schema, write_statistics=statistics) as writer:
         for first, length in ((0, 30), (30, 40), (70, 2)):
             writer.write_table(table.slice(first, length))
     column = pq.read_metadata(path).row_group(1).column(0)

@@ -8,6 +8,7 @@ import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.spec import ACTION_BOX, ACTION_NAMES, REWARD_TERMS, reflect
+from egovcp_collect.dataset.figures import _SUCCESS, _event_colour
 from egovcp_collect.dataset.statistics import (
     GRID_CELLS,
     HISTOGRAM_BINS,
@@ -54,13 +55,13 @@ def test_returns_equal_those_of_the_training_store(reader: DatasetReader) -> Non
 
 def test_events_ahead_equal_a_search_of_each_window(reader: DatasetReader) -> None:
     for rows in read_rows(reader, RETURNS):
-        good, bad = events_ahead(rows, RETURNS.steps)
+        success, failure = events_ahead(rows, RETURNS.steps)
         for first, length in zip(rows.start, rows.length, strict=True):
             span = slice(first, first + length)
             reward = rows.reward[span]
             windows = [reward[t : t + RETURNS.steps] for t in range(len(reward))]
-            assert good[span].tolist() == [bool((w > 0).any()) for w in windows]
-            assert bad[span].tolist() == [bool((w < 0).any()) for w in windows]
+            assert success[span].tolist() == [bool((w > 0).any()) for w in windows]
+            assert failure[span].tolist() == [bool((w < 0).any()) for w in windows]
 
 
 def test_events_ahead_come_from_recorded_terms_not_from_action_costs(tmp_path: Path) -> None:
@@ -70,9 +71,9 @@ def test_events_ahead_come_from_recorded_terms_not_from_action_costs(tmp_path: P
     terms[60, REWARD_TERMS.index("block")] = 1.0
     costs = replace(scene(0), reward=terms.sum(axis=1), reward_terms=terms)
     (rows,) = read_rows(write_scenes(tmp_path / "terms", [costs]), RETURNS)
-    good, bad = events_ahead(rows, RETURNS.steps)
-    assert np.flatnonzero(good).tolist() == [*range(51, 61)]
-    assert np.flatnonzero(bad).tolist() == [*range(31, 41)]
+    success, failure = events_ahead(rows, RETURNS.steps)
+    assert np.flatnonzero(success).tolist() == [*range(51, 61)]
+    assert np.flatnonzero(failure).tolist() == [*range(31, 41)]
 
 
 def test_events_are_counted_per_tick_and_per_episode(found: DatasetStatistics) -> None:
@@ -84,6 +85,29 @@ def test_events_are_counted_per_tick_and_per_episode(found: DatasetStatistics) -
     assert block.episode_share == pytest.approx(1 / 3)
     assert (hands.ticks, hands.episodes) == (3, 1)
     assert (ball.event_episodes, ball.good_episodes, ball.bad_episodes) == (2, 1, 1)
+
+
+def test_event_episodes_are_counted_by_column_not_by_the_name_of_the_term(tmp_path: Path) -> None:
+    terms = np.zeros((2, LENGTH, len(REWARD_TERMS)), np.float32)
+    terms[0, 20, REWARD_TERMS.index("block")] = 1.0
+    terms[:, 40, REWARD_TERMS.index("pose")] = -0.01
+    metadata = {"seed": 5, "episode": 0, "reward_terms": {"stop": {"sum": 1.0, "ticks": 1}}}
+    episodes = [
+        replace(scene(i), reward=t.sum(axis=1), reward_terms=t, task="bag", metadata=metadata)
+        for i, t in enumerate(terms)
+    ]
+    (bag,) = compute_statistics(write_scenes(tmp_path / "bag", episodes), RETURNS).tasks
+    assert (bag.event_episodes, bag.good_episodes, bag.bad_episodes) == (1, 1, 0)
+    assert bag.has_success_events
+    assert _event_colour("stop", bag.events["stop"]) == _SUCCESS
+
+
+@pytest.mark.parametrize(("task", "expected"), [("wall", False), ("ball", True)])
+def test_tasks_whose_reward_has_costs_only_have_no_success_events(
+    task: str, expected: bool, tmp_path: Path
+) -> None:
+    reader = write_scenes(tmp_path / task, [scene(0, {40: -1.0}, task=task, terms=("hit",))])
+    assert compute_statistics(reader, RETURNS).tasks[0].has_success_events == expected
 
 
 def test_outcomes_are_those_of_the_last_row(found: DatasetStatistics) -> None:
@@ -98,6 +122,10 @@ def test_drawn_parameters_have_their_range(found: DatasetStatistics) -> None:
     radius = ball.scene["scene.radius"]
     assert (radius.low, radius.median, radius.high) == (0.1, 0.11, 0.12)
     assert set(ball.scene) == {"event_tick", "scene.radius"}
+
+
+def test_the_source_of_a_merged_episode_is_not_drawn() -> None:
+    assert [*drawn_parameters([{"source": 0, "event_tick": 5}])] == ["event_tick"]
 
 
 def test_a_missing_parameter_is_skipped() -> None:
@@ -141,7 +169,6 @@ def test_episodes_without_metadata_and_returns_have_empty_statistics(sound: Path
         assert task.returns.spread is None
         assert task.returns.valid_share == 0.0
         assert task.events == {}
-        assert task.event_episodes == 0
 
 
 def actions(n: int = 100_000) -> np.ndarray:

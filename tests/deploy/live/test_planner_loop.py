@@ -172,6 +172,23 @@ def test_ctrl_c_twice_damps_after_a_failure(
     assert loop.quitting
 
 
+@pytest.mark.parametrize("mode", [State.STAND, State.ARMED])
+def test_after_ctrl_c_the_operator_cannot_start_the_robot(
+    mode: State, make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]
+) -> None:
+    requests = (OperatorRequest.ARM, OperatorRequest.RUN, OperatorRequest.HOLD)
+
+    def answer(mode: str) -> list[OperatorCommand]:
+        if not loop.interrupts:
+            loop.interrupts.append(signal.SIGINT)
+            return []
+        return [OperatorCommand(request) for request in requests]
+
+    control, loop, _ = make_loop(fails_at=1000, operator=ScriptedOperator(answer), mode=mode)
+    loop.run()
+    assert set(control.requests) == {OperatorRequest.HOLD}
+
+
 @pytest.mark.parametrize("what", ["operator", "log", "screen"])
 def test_failure_of_operator_log_or_display_holds_the_robot(
     what: str, make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]

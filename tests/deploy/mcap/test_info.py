@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from egovcp.log.tick import MotorReadings, Tick
-from egovcp_deploy.mcap.cli import main, summarise
+from egovcp_deploy.mcap.cli import main
+from egovcp_deploy.mcap.info import summarise
 
 from .conftest import Record
 

@@ -12,7 +12,8 @@ from mcap.writer import Writer
 
 from egovcp.log.mcap_reader import read_recording
 from egovcp.rate import NS_PER_S
-from egovcp_deploy.mcap.cli import main, summarise
+from egovcp_deploy.mcap.cli import main
+from egovcp_deploy.mcap.info import summarise
 
 from .conftest import INFO, Record
 

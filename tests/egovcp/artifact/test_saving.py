@@ -1,4 +1,4 @@
-"""What is written is what is loaded."""
+"""What is written is what is loaded, and an old artifact is replaced whole or not at all."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from egovcp import artifact as module
 from egovcp import spec
 from egovcp.artifact import CONFIG, WEIGHTS, load_artifact, save_artifact
 from egovcp.errors import ArtifactError
@@ -81,6 +82,51 @@ def test_options_that_contradict_the_weights_are_refused(folder: Path) -> None:
     sign(folder)
     with pytest.raises(ArtifactError, match=rf"{WEIGHTS}.*reward_head\S+ is missing"):
         load_artifact(str(folder))
+
+
+def test_an_older_artifact_is_replaced_and_nothing_is_left_over(folder: Path) -> None:
+    (folder / "stale").touch()
+    save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    loaded = load_artifact(str(folder)).world_model.state_dict()
+    expected = toy_model(seed=1).state_dict()
+    assert all(torch.equal(loaded[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("step", ["save", "write_json_file", "write_manifest"])
+def test_a_failure_while_writing_leaves_the_old_artifact(
+    folder: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, step, fail)
+        with pytest.raises(OSError, match="No space left"):
+            save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)  # leftovers do no harm
+    load_artifact(str(folder))
+
+
+def test_a_failing_rename_leaves_an_artifact(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the last moment, too: never neither the old one nor the new one."""
+    rename = Path.rename
+
+    def fail(self: Path, target: Path) -> Path:
+        if target == folder and self.name.endswith(".partial"):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", fail)
+        with pytest.raises(OSError, match="Input/output"):
+            save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    load_artifact(str(folder))
 
 
 def test_provenance_without_a_controller_is_refused_before_writing(tmp_path: Path) -> None:

@@ -118,6 +118,20 @@ def test_foreign_files_are_removed(
     require_same(tmp_path / "folder", publication)
 
 
+def test_damaged_content_is_refused_and_fetched_anew(
+    hub: FakeHub, publication: Publication, commit: str, tmp_path: Path
+) -> None:
+    name = "data/chunk-000/file-000.parquet"
+    blob = hub.store.blob(publication.contents[name].sha256)
+    sound = blob.read_bytes()
+    blob.write_bytes(sound[:-1] + b"?")
+    with pytest.raises(EnvironmentFailure, match=f"{name} differs from the Hub's hash"):
+        fetch("me/small", commit, tmp_path / "folder", HEALTHY)
+    blob.write_bytes(sound)
+    fetch("me/small", commit, tmp_path / "folder", HEALTHY)
+    require_same(tmp_path / "folder", publication)
+
+
 def test_no_file_is_written_outside_the_folder(hub: FakeHub, commit: str, tmp_path: Path) -> None:
     file = hub.store.add_small(b"x")
     evil = hub.store.advance("datasets/me/small", "main", "", "evil", {"../evil": file}).sha

@@ -280,3 +280,24 @@ class Nobody(Reach):
         register_task("robot_tasks:Reach")
     with pytest.raises(UsageError, match="lacks robot_class;"):
         register_task("robot_tasks:Nobody")
+
+
+def test_a_task_of_another_robot_must_be_a_robot_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = """
+from dataclasses import replace
+from egovcp.robot_spec import G1
+from post_task import PostTask
+
+class ArmTask(PostTask):
+    name = "arm"
+    @classmethod
+    def robot_spec(cls):
+        return replace(G1, robot_type="arm")
+"""
+    (tmp_path / "post_task.py").write_text(SOURCE)
+    (tmp_path / "arm_tasks.py").write_text(source)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(UsageError, match="its robot is not the G1; derive it from"):
+        register_task("arm_tasks:ArmTask")

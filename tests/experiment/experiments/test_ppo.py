@@ -46,7 +46,7 @@ def test_played_policies_are_saved_ones() -> None:
         for iteration in ("000010", "000020")
     ]
     planner = cells["play-ball-default-s3"]
-    for play in (*plays, cells["references-ball"]):
+    for play in (*plays, cells["bounds-ball"]):
         assert [play.flags[k] for k in ("task", "episodes", "seed", "env.controller")] == [
             planner.flags[k] for k in ("task", "episodes", "seed", "env.controller")
         ]
@@ -70,7 +70,7 @@ def test_flags_that_change_which_policies_are_saved_are_refused() -> None:
 def test_sample_efficiency_shares_the_trainings() -> None:
     ours = {cell.name: cell for cell in PPO.cells(CONFIG)}
     curves = {cell.name: cell for cell in EXPERIMENTS["sample-efficiency"].cells(CONFIG)}
-    shared = {"ppo-ball-s3", "play-ball-ppo_500-s3", "play-ball-ppo_1000-s3", "references-ball"}
+    shared = {"ppo-ball-s3", "play-ball-ppo_500-s3", "play-ball-ppo_1000-s3", "bounds-ball"}
     assert {name for name in curves if "ppo" in name or name in ours} >= shared
     assert all(curves[name] == ours[name] for name in shared)
     no_ppo = replace(CONFIG, ppo=PpoBaselineConfig(steps=0))
@@ -106,7 +106,7 @@ def test_conclusions_follow_from_the_scores() -> None:
         "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
         "play-ball-ppo_500-s3": {"figures": {"ball": played("ppo", 5, 0.2)}},
         "play-ball-ppo_1000-s3": {"figures": {"ball": played("ppo", 10, 0.2)}},
-        "references-ball": {
+        "bounds-ball": {
             "figures": {
                 "ball": {
                     **played("hold", 2, 0.1),

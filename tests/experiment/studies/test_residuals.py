@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egovcp.policy_options import PolicyOptions
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
+from egovcp_collect.config import CollectConfig
 from egovcp_experiment.cell import read_json
 from egovcp_experiment.studies.residuals import (
     STEPS,
+    ResidualsConfig,
     _branches,
     _Start,
     analysis,
@@ -61,11 +64,30 @@ def test_a_resting_walk_holds_the_last_action_of_the_plan() -> None:
         assert np.isclose(short[k], stood, rtol=1e-9).any()
 
 
+def test_the_walk_is_that_of_the_collector_by_default() -> None:
+    study, data = ResidualsConfig(), CollectConfig()
+    assert (study.eta, study.step_ticks) == (data.eta, data.step_ticks)
+    assert study.boundary == data.boundary
+
+
+def test_times_between_steps_in_the_wrong_order_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"--output_dir={tmp_path / 'out'}", "--step_ticks=[5,3]"]) == 2
+    assert "--step_ticks=[5, 3]: expected 1 <= shortest" in capsys.readouterr().err
+
+
+def test_a_policy_that_was_not_trained_on_returns_is_warned_about(
+    policy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ResidualsConfig(policy=PolicyOptions(path=str(policy))).load()
+    assert "trained with q_target=privileged, not on returns" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_the_study_measures_both_kinds_of_plans(flags: list[str], tmp_path: Path) -> None:
     few = [flag for flag in flags if not flag.startswith("--episodes")]
-    walk = ["--eta=1", "--step_ticks=[5,15]"]
-    assert main([*few, *walk, "--episodes=3", "--branches=2", "--task=ball"]) == 0
+    assert main([*few, "--episodes=3", "--branches=2", "--task=ball"]) == 0
     found = read_json(tmp_path / "out" / "result.json")
     assert found["return_steps"] == 8
     for row in found["plans"].values():

@@ -27,6 +27,13 @@ _MIN_WIDTH: Final = 0.16  # m between the feet, across
 _MAX_ROTATION: Final = 10.0  # rad^2/s^2, bound of the terms of the torso's rotation
 _FALLEN_TILT: Final = 0.8  # rad off the natural pitch
 _FALLEN_HEIGHT: Final = 0.2  # m below the height's reference
+#: Squared errors at which a term falls to 1 / e.
+_VELOCITY_SCALE: Final = 0.03  # m^2/s^2
+_TURNING_SCALE: Final = 0.1  # rad^2/s^2
+_HEIGHT_SCALE: Final = 0.001  # m^2
+_UPRIGHT_SCALE: Final = 0.03  # of the vertical, a unit vector
+_WALKING_GAIT: Final = 0.5  # amount of gait above which feet must swing
+_SWING: Final = 0.25  # sine of the phase above which a foot must swing
 
 
 class AverageVelocity:
@@ -36,7 +43,7 @@ class AverageVelocity:
         self.value = np.zeros((robots, 3))  # m/s ahead and across, rad/s
 
     def reset(self, rows: NDArray[np.intp]) -> None:
-        """Robots that start from rest."""
+        """Set the average of ``rows`` to zero."""
         self.value[rows] = 0.0
 
     def add(self, x: Snapshot) -> None:
@@ -71,22 +78,23 @@ def terms(
         pushed: (N,) whether a push was so recent that steps cost nothing.
     """
     height, pitch, gait = walk.height, walk.pitch, walk.gait.amount
-    turn = rotation_matrix(x.quaternion)
-    forward = heading(turn)
-    up = turn[:, 2]  # the world's vertical in the pelvis frame
+    rotation = rotation_matrix(x.quaternion)
+    forward = heading(rotation)
+    up = rotation[:, 2]  # the world's vertical in the pelvis frame
     off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
     on = standing_feet(x)
     feet = to_heading_xy(x.feet - x.position[:, None], forward)
     ahead = to_heading_xy(x.feet_forward, forward)
     width = feet[:, 0, 1] - feet[:, 1, 1]
     torque = x.torque[:, :NU] / EFFORT_LIMIT[:NU]
+    velocity_error = np.sum((motion[:, :2] - command[:, :2]) ** 2, axis=1)
     slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * on
     return {
         "alive": np.ones(len(height)),
-        "velocity": np.exp(-np.sum((motion[:, :2] - command[:, :2]) ** 2, axis=1) / 0.03),
-        "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / 0.1),
-        "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
-        "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
+        "velocity": np.exp(-velocity_error / _VELOCITY_SCALE),
+        "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / _TURNING_SCALE),
+        "height": np.exp(-((x.position[:, 2] - height) ** 2) / _HEIGHT_SCALE),
+        "upright": np.exp(-np.sum(off**2, axis=1) / _UPRIGHT_SCALE),
         "contact": _feet_in_phase(on, walk.gait.phase, gait),
         "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDING_SPEED) * ~pushed,
         "torso_rate": np.minimum(_off_turning(torso.rate, command), _MAX_ROTATION),
@@ -110,10 +118,11 @@ def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
 
 
 def finite_terms(
-    terms: dict[str, Array], fell: NDArray[np.bool_], broken: NDArray[np.bool_]
+    values: dict[str, Array], fell: NDArray[np.bool_], broken: NDArray[np.bool_]
 ) -> dict[str, Array]:
-    """`terms` and the ``fall``, all finite; 0 for a robot whose simulation diverged."""
-    finite = {name: np.where(broken, 0.0, np.nan_to_num(v)) for name, v in terms.items()}
+    """The ``values`` of `terms` and the ``fall``, all finite; 0 for a robot whose simulation
+    diverged."""
+    finite = {name: np.where(broken, 0.0, np.nan_to_num(v)) for name, v in values.items()}
     return finite | {"fall": fell.astype(np.float64)}
 
 
@@ -127,7 +136,7 @@ def _off_turning(rate: Array, command: Array) -> Array:
 def _feet_in_phase(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
     """Share of the feet that stand or swing as the phase requires; without a gait, all stand."""
     swing = np.stack([np.sin(phase), -np.sin(phase)], axis=1) * gait[:, None]
-    either = np.abs(swing) < 0.25
-    either &= gait[:, None] > 0.5
-    right = np.where(either, True, on == (swing < 0.25))
-    return np.asarray(np.mean(right, axis=1))
+    either = np.abs(swing) < _SWING
+    either &= gait[:, None] > _WALKING_GAIT
+    in_phase = np.where(either, True, on == (swing < _SWING))
+    return np.asarray(np.mean(in_phase, axis=1))
