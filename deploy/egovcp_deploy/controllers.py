@@ -21,6 +21,7 @@ from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import SEARCH, Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
+from egovcp.terminal import echo
 from egovcp.values import differences
 from egovcp_deploy.options import PLANNER
 from egovcp_deploy.scores import EpisodeScore, eval_scores
@@ -119,7 +120,7 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
     try:
         content = read_json(path)
         constants = {task: _parse(task, entry) for task, entry in content["constants"].items()}
-        known = {name: content[name] for name in setting}
+        known = {name: content[name] for name in setting if name in content}
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(f"cannot read --constant.path={path}: {reason}") from error
@@ -127,6 +128,8 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
         raise DataError(
             f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"
         ) from error
+    if not known:
+        echo(f"--constant.path={path} names no controller and environment: used unchecked")
     for name, (old, new) in differences(known, setting):
         if old is not None:  # None: unknown, as an option of a later version
             raise UsageError(

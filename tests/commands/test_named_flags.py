@@ -21,7 +21,7 @@ FLAG = re.compile(r"(?<![\w.-])--[a-z]\w*(?:\.\w+)*")
 #: Of every command; and what stands for any name.
 COMMON = {"--debug", "--help", "--version", "--config_path", "--name", "--group.option", "--a"}
 #: Flags of other programs that our code starts or names.
-FOREIGN = {"--bind", "--port", "--serve", "--web", "--expect", "--user"}
+FOREIGN = {"--bind", "--port", "--serve", "--web", "--expect", "--user", "--pdeathsig"}
 APPLICATIONS = {
     "collect": ("egovcp-collect", "egovcp-dataset"),
     "train": ("egovcp-train", "egovcp-push", "egovcp-export", "egovcp-eval-"),
