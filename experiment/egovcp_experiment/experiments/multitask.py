@@ -10,11 +10,11 @@ import numpy as np
 from egovcp.eval_scores import EvalScores, points_range
 from egovcp_experiment import results
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, MIXED, REFERENCES, Grid
+from egovcp_experiment.grid import ALL, MIXED, Grid
 from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
 
 _LATENT_EPISODES: Final = 16  # per task
-_REFERENCES: Final = (*REFERENCES, "constant")
+_REFERENCES: Final = ("hold", "constant", "random", "oracle")
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
