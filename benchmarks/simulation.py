@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 from report import parser, publish
 
-from egovcp.data import DatasetConfig, schema
+from egovcp.data import schema
 from egovcp.hardware import available_cores
 from egovcp.robot import arms
 from egovcp.sim.camera import DepthNoise, RayCastCamera
@@ -37,7 +37,7 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.collect import collect
-from egovcp_collect.config import CollectConfig
+from egovcp_collect.config import CollectConfig, NewDatasetConfig
 
 ENVS = 16
 
@@ -91,7 +91,7 @@ def collection_rate(config: CollectConfig) -> float:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         root = Path(folder) / "dataset"
         start = time.perf_counter()
-        collect(replace(config, dataset=DatasetConfig(root=str(root))))
+        collect(replace(config, dataset=NewDatasetConfig(root=str(root))))
         seconds = time.perf_counter() - start
         info = json.loads((root / schema.INFO_PATH).read_text(encoding="utf-8"))
     return float(info["total_frames"]) / seconds

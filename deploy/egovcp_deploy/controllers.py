@@ -115,8 +115,8 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
 
 def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestConstant]:
     """Task -> result, from the ``constant.json`` of an earlier evaluation in the same ``setting``
-    (controller and environment). Raises `DataError` if it is missing or of another format,
-    `UsageError` if the settings differ."""
+    (controller and environment); without any, a note is printed. Raises `DataError` if it is
+    missing or of another format, `UsageError` if the settings differ."""
     try:
         content = read_json(path)
         constants = {task: _parse(task, entry) for task, entry in content["constants"].items()}
