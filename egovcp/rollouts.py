@@ -15,7 +15,7 @@ from egovcp.errors import DataError
 from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.rate import NS_PER_S
 from egovcp.robot_spec import RobotSpec
-from egovcp.spec import PLANNER_HZ
+from egovcp.spec import EVENT_REWARD, PLANNER_HZ
 
 #: Key of `RunInfo.hashes` that names the low-level controller.
 CONTROLLER: Final = "low_level_controller"
@@ -23,7 +23,6 @@ POSE: Final = (
     "The pelvis pose is not recorded: the robot is drawn at the origin, at its commanded height, "
     "with the tilt of its IMU."
 )
-_EVENT_REWARD: Final = 0.2  # from the median; a block, a hit, a passage or a fall
 _SEED_DIGITS: Final = 12  # hexadecimal; larger than seeds of collections and evaluations
 
 
@@ -37,7 +36,7 @@ def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
         camera=camera_view(known.get("config", {}), facts),
         config={
             **known.get("config", {}),
-            "pose": POSE,
+            **({"pose": POSE} if reader.robot.is_g1 else {}),
             "dataset": str(reader.root),
             "index in the dataset": index,
             "scenario": dict(facts),
@@ -87,7 +86,7 @@ def _events(episode: Episode, t: int) -> Iterator[str]:
         yield "the event of the task"
     if t > 0 and episode.success[t] != episode.success[t - 1]:
         yield "success" if episode.success[t] else "no success any more"
-    if abs(episode.reward[t] - np.median(episode.reward)) > _EVENT_REWARD:
+    if abs(episode.reward[t] - np.median(episode.reward)) > EVENT_REWARD:
         yield f"reward {episode.reward[t]:+.3f}"
     if episode.done[t]:
         yield "a fall ends the episode" if episode.terminated else "the time is up"

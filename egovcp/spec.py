@@ -166,6 +166,9 @@ ACTION_TERMS: Final = ("pose", "action_rate")
 POSE_COST: Final = 0.02  # per planner tick, times the mean squared action; 0 in the neutral pose
 #: Per planner tick, times the mean squared change of the action over `ACTION_RATE_LIMIT`.
 ACTION_RATE_COST: Final = 0.05
+#: Least change of the reward by an event, where the terms are not recorded: events count 1, the
+#: costs of pose and action rate at most 0.07.
+EVENT_REWARD: Final = 0.08
 
 
 # --- scene -----------------------------------------------------------------------

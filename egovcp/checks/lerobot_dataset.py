@@ -84,9 +84,7 @@ class LeRobotCheck:
     def table_problems(self) -> Iterator[DataError]:
         """Problems of ``info.json`` and ``meta/episodes``."""
         reader, info = self.reader, self.reader.root / schema.INFO_PATH
-        for key in schema.INDEX_FEATURES:
-            if key not in reader.features:
-                yield DataError.at(info, f"feature {key} is missing; LeRobot adds it to all data")
+        yield from self.index_feature_problems()
         names = set(reader.tasks.values())
         end = 0
         for number, row in enumerate(reader.rows):
@@ -108,6 +106,13 @@ class LeRobotCheck:
                     yield DataError.at(info, problem)
             for problem in split_problems(reader.info, len(reader.rows)):
                 yield DataError.at(info, problem)
+
+    def index_feature_problems(self) -> Iterator[DataError]:
+        """The features of indices and times that ``info.json`` lacks."""
+        for key in schema.INDEX_FEATURES:
+            if key not in self.reader.features:
+                problem = f"feature {key} is missing; LeRobot adds it to all data"
+                yield DataError.at(self.reader.root / schema.INFO_PATH, problem)
 
     def file_problems(self, path: Path, progress: Progress | None = None) -> Iterator[DataError]:
         """Problems of a data file, its episodes, and their videos and statistics."""
@@ -291,9 +296,10 @@ class LeRobotCheck:
         if values is None:
             return
         self._valid_frames += len(table)
-        at = first_difference(values["index"][:, 0], first + np.arange(len(table)))
-        if at is not None:
-            yield DataError.at(path, f"column index does not count from {first}", number, at)
+        if "index" in values:
+            at = first_difference(values["index"][:, 0], first + np.arange(len(table)))
+            if at is not None:
+                yield DataError.at(path, f"column index does not count from {first}", number, at)
         for key, feature in self.reader.features.items():
             if key not in values or not feature.is_numeric or key in STALE:
                 continue

@@ -28,10 +28,9 @@ _FLOAT32: Final = 2.0**-22  # relative error of a float32 timestamp
 
 def value_problems(values: Mapping[str, NDArray[Any]], reader: LeRobotReader) -> Iterator[Problem]:
     for key, array in values.items():
-        if array.dtype.kind == "f" and not (finite := np.isfinite(array)).all():
-            at = int(np.argmin(finite.all(1)))
-            label = reader.features[key].label(int(np.argmin(finite[at])))
-            yield at, f"{label} is {array[at][~finite[at]][0]}, expected a finite number"
+        nonfinite = nonfinite_problem(array, reader.features[key])
+        if nonfinite is not None:
+            yield nonfinite
     if "frame_index" in values:
         found = values["frame_index"][:, 0]
         at_frame = first_difference(found, np.arange(len(found)))
@@ -47,6 +46,15 @@ def value_problems(values: Mapping[str, NDArray[Any]], reader: LeRobotReader) ->
             at = int(np.argmin(known))
             index = values["task_index"][at, 0]
             yield at, f"task_index {index} is not in {schema.TASKS_PATH}, which has no text for it"
+
+
+def nonfinite_problem(values: NDArray[Any], feature: Feature) -> tuple[int, str] | None:
+    """The first NaN or infinity in the values (T, n) of a feature; None if all are finite."""
+    if values.dtype.kind != "f" or (finite := np.isfinite(values)).all():
+        return None
+    at = int(np.argmin(finite.all(1)))
+    index = int(np.argmin(finite[at]))
+    return at, f"{feature.label(index)} is {values[at, index]}, expected a finite number"
 
 
 def _time_problems(times: NDArray[np.float64], fps: float, has_videos: bool) -> Iterator[Problem]:

@@ -31,16 +31,21 @@ SPLITS: Final = ("train", "heldout", "all")
 HELDOUT_FRACTION: Final = 0.05
 MAX_LISTED: Final = 5000  # episode numbers
 RULE: Final = (
-    "an episode is held out if uint64(SHA-256(task/seed/episode)[:8]) / 2**64 < fraction; if that "
-    "selects none of at least two, the one with the lowest value"
+    "an episode is held out if v / 2**64 < fraction, where v is the big-endian uint64 of the first "
+    "8 bytes of SHA-256('task/seed/episode'); if that selects none of at least two, the one with "
+    "the lowest v is"
 )
 
 
 def in_split(identities: Sequence[str], split: str) -> list[bool]:
-    """Whether each of the episodes with these identities belongs to ``split`` (see `RULE`)."""
+    """Whether each of the episodes with these identities belongs to ``split`` (see `RULE`).
+
+    Raises:
+        UsageError: unknown split.
+    """
     if split not in SPLITS:
         raise UsageError(f"unknown split {split!r}{suggest(split, SPLITS)}")
-    if split == "all":
+    if split == "all" or not identities:
         return [True] * len(identities)
     hashes = [_hash_fraction(identity) for identity in identities]
     bound, lowest = HELDOUT_FRACTION, min(hashes)
@@ -69,7 +74,9 @@ class EpisodeIndex:
     def of(cls, readers: Sequence[DatasetReader], split: str = "all") -> Self:
         """The selected episodes of the datasets that belong to a split.
 
-        Raises `DataError` if the datasets cannot be mixed, or the split is empty.
+        Raises:
+            UsageError: unknown split.
+            DataError: the datasets cannot be mixed, or the split is empty.
         """
         require_mixable(readers)
         places = [(d, i) for d, reader in enumerate(readers) for i in reader.selected.tolist()]
@@ -77,8 +84,8 @@ class EpisodeIndex:
         chosen = list(compress(places, in_split(identities, split)))
         if not chosen:
             raise DataError(
-                f"none of the {len(places)} episodes falls into split {split!r}: collect more, or "
-                "add other datasets"
+                f"none of the {len(places)} episodes falls into split {split!r}: collect more, "
+                "add other datasets, or select more with --dataset.episodes"
             )
         dataset, number = np.array(chosen, dtype=np.int64).T
         return cls(tuple(readers), dataset, number)
@@ -93,6 +100,7 @@ class EpisodeIndex:
         return self.select(np.sort(np.concatenate(kept)))
 
     def select(self, episodes: NDArray[np.int64]) -> EpisodeIndex:
+        """The index of these of its episodes, in the order given."""
         return EpisodeIndex(self.readers, self.dataset[episodes], self.number[episodes])
 
     @cached_property
@@ -103,6 +111,7 @@ class EpisodeIndex:
 
     @property
     def num_frames(self) -> int:
+        """Frames of all episodes."""
         return int(self.length.sum())
 
     @property
@@ -122,6 +131,7 @@ class EpisodeIndex:
 
     @cached_property
     def fingerprint(self) -> str:
+        """Hash of the episodes (see `episodes_fingerprint`)."""
         return episodes_fingerprint(self.identities, self.length)
 
     @property
@@ -142,6 +152,10 @@ class EpisodeIndex:
             reader.download(number)
 
     def prefetch(self, episodes: Sequence[int]) -> None:
+        """Start to download the files of these episodes that are not on disk, in the background.
+
+        Errors are raised when an episode is read.
+        """
         for reader in self.readers:
             if reader.is_remote:
                 places = map(self._place, episodes)
@@ -159,8 +173,16 @@ class EpisodeIndex:
         return reader.to_episode(number, columns)
 
     def state_statistics(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mean and standard deviation (S,) of the state over all frames, from the statistics of
-        each episode in ``meta/episodes``; no data file is read."""
+        """Mean m and standard deviation s (S,) of the state over all N frames.
+
+        They follow from the length n_e, mean m_e and standard deviation s_e of each episode in
+        ``meta/episodes``; no data file is read::
+
+            m = sum_e (n_e / N) m_e,   s^2 = sum_e (n_e / N) (s_e^2 + (m_e - m)^2)
+
+        Raises:
+            DataError: the statistics are not recorded, or not complete.
+        """
         stats = [reader.episode_stats(spec.STATE_KEY) for reader in self.readers]
         mean, std = (np.stack([stats[d][k][i] for d, i in self._places]) for k in (0, 1))
         weight = (self.length / self.num_frames)[:, None]

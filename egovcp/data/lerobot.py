@@ -163,7 +163,7 @@ class LeRobotReader:
         """Some columns of the rows of an episode.
 
         Raises:
-            DataError: its rows are missing or damaged, or the file is.
+            DataError: its rows or a column are missing or damaged, or the file is.
         """
         file = self.open_data(row.data_path)
         columns = [*dict.fromkeys([*keys, "episode_index"])]
@@ -172,7 +172,11 @@ class LeRobotReader:
                 if found.episode in (None, row.index):
                     raise found
             elif found[0] == row.index:
-                return found[1]
+                table = found[1]
+                for key in columns:
+                    if key not in table.column_names:
+                        raise DataError.at(row.data_path, f"column {key} is missing", row.index)
+                return table
         raise DataError.at(row.data_path, "has no rows of this episode", row.index)
 
     def _table_rows(self, path: Path) -> Iterator[EpisodeRow]:

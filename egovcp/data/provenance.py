@@ -121,7 +121,7 @@ class Duplicate[P](NamedTuple):
     """An earlier episode that is repeated by a later one.
 
     If its content is not ``equal``, seed, number and provenance are: one of the two was altered, or
-    they were simulated on different machines.
+    collected with changed code of the same version.
     """
 
     place: P

@@ -34,14 +34,14 @@ from egovcp.data.parquet import (
 )
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
-from egovcp.data.source import Source, hub_cache, is_local, locate, select_episodes
+from egovcp.data.source import Source, locate, locate_on_demand, select_episodes
 from egovcp.dataset_options import DatasetConfig, SelectedDatasetConfig
 from egovcp.errors import DataError, suggest
 from egovcp.hub import HubFileCache, RetryPolicy, is_local_path
 
 _OPEN_FILES = 8
 _RETRY_POLICY = RetryPolicy()
-_TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
+_TIMESTAMP_TOLERANCE_S = 1e-3  # timestamps are float32
 
 
 class DatasetReader:
@@ -91,13 +91,25 @@ class DatasetReader:
     def open(cls, config: DatasetConfig) -> Self:
         """Open the dataset that ``config`` names, from disk or from the Hub (see `locate`).
 
-        It is opened again if a collector replaces it by its next version while it is read.
+        Raises as `locate`, and `DataError` if it is damaged.
         """
-        source = locate(config)
+        return cls.open_source(locate(config), episodes=_selection(config))
+
+    @classmethod
+    def open_source(
+        cls, source: Source, cache: HubFileCache | None = None, episodes: str = ""
+    ) -> Self:
+        """Open a dataset that `locate` or `locate_on_demand` found.
+
+        One on disk is opened again if a collector replaces it by its next version while it is read.
+        For ``cache`` and ``episodes`` see the constructor.
+        """
+        if cache is not None:
+            return cls(source, cache, episodes)
         while True:
             version = os.stat(source.root).st_ino
             try:
-                reader = cls(source, episodes=_selection(config))
+                reader = cls(source, episodes=episodes)
             except DataError:
                 if os.stat(source.root).st_ino == version:
                     raise
@@ -112,10 +124,7 @@ class DatasetReader:
     def on_demand(cls, config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Self:
         """As `open`, but files on the Hub are downloaded when they are read, at the commit to which
         the revision resolves now."""
-        if is_local(config):
-            return cls.open(config)
-        cache = HubFileCache(config.repo_id, config.revision, retry, hub_cache(), ["meta/*"])
-        return cls(Source(cache.folder, cache.repo_id, cache.commit), cache, _selection(config))
+        return cls.open_source(*locate_on_demand(config, retry), _selection(config))
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -131,6 +140,7 @@ class DatasetReader:
 
     @property
     def num_frames(self) -> int:
+        """Frames of all episodes."""
         return int(self.lengths.sum())
 
     @property
@@ -268,6 +278,7 @@ class DatasetReader:
             self._cache.get(self._name(index))
 
     def prefetch(self, indices: Sequence[int]) -> None:
+        """Start to download the files of these episodes; see `HubFileCache.prefetch`."""
         if self._cache is not None:
             self._cache.prefetch(map(self._name, indices))
 
@@ -317,9 +328,9 @@ class DatasetReader:
                 at = int(wrong[0])
                 found = columns[name][at]
                 yield at, f"column {name} is {found}, expected {expected[at]}"
-        mistimed = ~(np.abs(columns["timestamp"] - frames / self.fps) <= _TIMESTAMP_SLACK)
-        if mistimed.any():
-            at = int(np.argmax(mistimed))
+        wrong_time = mistimed(columns["timestamp"], self.fps)
+        if wrong_time.any():
+            at = int(np.argmax(wrong_time))
             found = columns["timestamp"][at]
             yield at, f"timestamp {found:g} s, expected {at / self.fps:g} at {self.fps} fps"
         own = [number for number, name in self.task_names.items() if name == self.task(index)]
@@ -328,6 +339,12 @@ class DatasetReader:
             at = int(np.argmax(other))
             found = self.task_names.get(int(columns["task_index"][at]), "unknown")
             yield at, f"its task is {found}, but {schema.COLLECTION_PATH} says {self.task(index)}"
+
+
+def mistimed(timestamp: NDArray[np.floating], fps: float) -> NDArray[np.bool_]:
+    """(T,) whether the timestamp of frame t, s, differs from t / fps, or is NaN."""
+    late = np.abs(timestamp - np.arange(len(timestamp)) / fps)
+    return np.asarray(~(late <= _TIMESTAMP_TOLERANCE_S))
 
 
 def _selection(config: DatasetConfig) -> str:

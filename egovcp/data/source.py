@@ -20,7 +20,7 @@ from egovcp.data.dataset_files import create_json
 from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError, suggest_path
 from egovcp.files import read_json
-from egovcp.hub import RetryPolicy, is_repo_id, snapshot
+from egovcp.hub import HubFileCache, RetryPolicy, is_repo_id, snapshot
 
 _RETRY_POLICY = RetryPolicy()
 _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
@@ -43,7 +43,16 @@ def lerobot_home() -> Path:
 
 
 def local_root(config: DatasetConfig) -> Path:
-    """The folder that ``config`` names: its root, or LeRobot's folder for the repo id."""
+    """The folder that ``config`` names: its root, or LeRobot's folder for the repo id.
+
+    Raises:
+        UsageError: bad or missing id, or a revision given with a folder.
+    """
+    if config.root and config.revision:
+        raise UsageError(
+            "--dataset.revision selects a version on the Hub and cannot be checked for a folder; "
+            "drop it, or drop --dataset.root"
+        )
     if config.root:
         return Path(os.path.expanduser(config.root)).absolute()
     _require_repo_id(config.repo_id)
@@ -62,11 +71,6 @@ def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     root = local_root(config)
-    if config.root and config.revision:
-        raise UsageError(
-            "--dataset.revision selects a version on the Hub and cannot be checked for a folder; "
-            "drop it, or drop --dataset.root"
-        )
     if (root / schema.INFO_PATH).is_file() and not config.revision:
         return read_source(root, config.repo_id)
     if config.root:
@@ -74,6 +78,19 @@ def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
         raise DataError(f"no dataset at {root}: {schema.INFO_PATH} is missing")
     folder = snapshot(config.repo_id, config.revision, retry, cache_dir=hub_cache())
     return Source(folder, config.repo_id, commit=folder.name)
+
+
+def locate_on_demand(
+    config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY
+) -> tuple[Source, HubFileCache | None]:
+    """As `locate`, but of a dataset on the Hub only its `meta` folder is downloaded.
+
+    The cache downloads its other files when they are needed; None: all files are in the folder.
+    """
+    if is_local(config):
+        return locate(config, retry), None
+    cache = HubFileCache(config.repo_id, config.revision, retry, hub_cache(), ["meta/*"])
+    return Source(cache.folder, cache.repo_id, cache.commit), cache
 
 
 def require_folder(root: Path) -> None:

@@ -73,9 +73,14 @@ def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
 
 
 def aggregate_named(parts: Sequence[tuple[int, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
-    """Statistic -> its value for the union of parts, which have these frame counts."""
+    """Statistic -> its value for the union of parts, which have these frame counts.
+
+    Of the statistics, min, max, mean and std must be in all parts; one that a part lacks is left
+    out.
+    """
     counts = np.array([count for count, _ in parts], np.float64)
-    stacked = {name: np.stack([part[name] for _, part in parts]) for name in parts[0][1]}
+    names = [name for name in parts[0][1] if all(name in part for _, part in parts)]
+    stacked = {name: np.stack([part[name] for _, part in parts]) for name in names}
     weight = counts.reshape(-1, *[1] * (stacked["mean"].ndim - 1))
     out = {name: (values * weight).sum(0) / counts.sum() for name, values in stacked.items()}
     spread = stacked["std"] ** 2 + (stacked["mean"] - out["mean"]) ** 2

@@ -150,10 +150,12 @@ class EpisodeStore:
 
     @property
     def num_frames(self) -> int:
+        """Frames of all episodes."""
         return len(self.reward)
 
     @property
     def fingerprint(self) -> str:
+        """Hash of the episodes (see `episodes_fingerprint`)."""
         return episodes_fingerprint(self.identities, self.length)
 
 

@@ -21,7 +21,7 @@ from egovcp.outputs import output_file
 from egovcp.sim.config import BaseEnvConfig, EnvConfig
 from egovcp.sim.tasks.registry import describe_task
 from egovcp.terminal import echo
-from egovcp_collect.dataset.coverage import assess, coverage_column, summary
+from egovcp_collect.dataset.coverage import assess, coverage_texts, summary
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.statistics import DatasetStatistics, TaskStatistics, compute_statistics
 
@@ -177,16 +177,16 @@ def _format(value: object) -> str:
 
 def coverage_table(tasks: Sequence[TaskStatistics]) -> str:
     """Statistics, one column per task."""
-    columns = [coverage_column(task) for task in tasks]
+    columns = [coverage_texts(task) for task in tasks]
     rows = [(name, *(column[name] for column in columns)) for name in columns[0]]
     return markdown_table(("", *(task.task for task in tasks)), rows)
 
 
 def event_table(tasks: Sequence[TaskStatistics]) -> str:
-    """Rate of each reward term."""
+    """Rate of each reward term and contact."""
     rows = [
         (task.task, f"`{name}`", f"{rate.per_1000_ticks:.2f}", f"{rate.episode_share:.1%}")
         for task in tasks
-        for name, rate in task.events.items()
+        for name, rate in task.term_rates.items()
     ]
     return markdown_table(("task", "term", "per 1000 ticks", "episodes"), rows)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
@@ -19,6 +15,7 @@ from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, one_line
+from egovcp_collect.progress import progress_bar
 
 
 @dataclass(frozen=True)
@@ -36,28 +33,37 @@ class CheckConfig:
     """Stop after this many problems."""
     json: str = output_file()
     """File for the result: {"ok", "episodes", "frames", "problems": [{"file", "episode", "frame",
-    "problem"}], "not_checked": [...]}; empty: none."""
+    "problem"}], "not_checked": [...], null if it stopped after max_problems}; empty: none."""
 
 
 def run_check(config: CheckConfig) -> None:
-    """Print every problem, and a summary."""
+    """Print every problem, and a summary.
+
+    Raises:
+        DataError: there is a problem, or no dataset.
+        UsageError: bad or missing id, or a revision given with a folder.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
     root = local_root(config.dataset)
     if not (config.dataset.root and root.is_dir()):  # `locate` would stop at the first problem
         root = locate(config.dataset).root
     with progress_bar() as progress:
         notes: list[str] = []
         problems = list(islice(dataset_problems(root, progress, notes), config.max_problems))
+    stopped = len(problems) == config.max_problems
     episodes, frames = _size(root)
     result = {
         "ok": not problems,
         "episodes": episodes,
         "frames": frames,
         "problems": [problem_as_json(p, root) for p in problems],
-        "not_checked": notes,
+        "not_checked": None if stopped else notes,
     }
     write_report(config.json, result)
     for problem in problems:
         echo(one_line(problem))
+    if stopped:
+        echo(f"stopped after {len(problems)} problems; the rest was not checked")
     for note in notes:
         echo(one_line(f"not checked: {note}"))
     if hidden := sum(len(list((root / name).rglob(".*"))) for name in ("data", "meta")):
@@ -67,24 +73,13 @@ def run_check(config: CheckConfig) -> None:
             f"would read; remove them: find {folders} -name '.*' -prune -exec rm -r {{}} +"
         )
     if problems:
-        more = " or more" if len(problems) == config.max_problems else ""
+        more = " or more" if stopped else ""
         raise DataError(
             f"{len(problems)}{more} problem(s) in {root}, the first: {problems[0]}; "
-            f"`egovcp-dataset repair {root} --output_dir=NEW` keeps the valid episodes"
+            f"`egovcp-dataset repair {shlex.quote(str(root))} --output_dir=NEW` keeps the valid "
+            "episodes"
         )
     echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
-
-
-@contextmanager
-def progress_bar(title: str = "") -> Iterator[Callable[[int, int], None]]:
-    """A progress bar, as a function of the episodes done and their total."""
-    with tqdm(desc=title or None, unit="ep", delay=1) as bar:
-
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done - bar.n)
-
-        yield show
 
 
 def _size(root: Path) -> tuple[int, int]:

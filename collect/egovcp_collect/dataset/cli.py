@@ -25,7 +25,7 @@ COMMANDS: Final = CommandGroup(
             ("pull", "hub:run_pull", "download one commit from the Hub to a new folder", ""),
         )
     },
-    "DATASET: a folder or, if there is none of that name, a Hub id user/name. push, repair and the "
-    "OTHERS of merge take folders only; pull takes a Hub id.",
+    "DATASET: a folder, else a Hub id user/name (LeRobot's local copy, if there is one). push, "
+    "repair and the OTHERS of merge take folders only; pull takes a Hub id.",
 )
 main = COMMANDS.main

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.checks.lerobot_episode import Statistics, describe
+from egovcp.checks.lerobot_episode import Statistics, describe, nonfinite_problem
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
 from egovcp.data.features import values_of
 from egovcp.data.lerobot import LeRobotReader, is_own
@@ -26,24 +26,24 @@ from egovcp_collect.dataset.statistics import (
     compute_statistics,
 )
 
-_CONSTANT: Final = 1e-8  # standard deviation relative to the magnitude
+_CONSTANT: Final = 1e-8  # largest std of a constant value, relative to max(1, |mean|)
 _SHORT_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class CoverageLimits:
-    """Limits beyond which a dataset may be unsuitable for training. They are estimates: 2000 ball
-    episodes with 800 blocks were enough to train Q."""
+    """Limits beyond which a dataset may be unsuitable for training."""
 
     event_episodes: int = 100  # least episodes of a task with a success or failure event
     event_episodes_per_1000: float = 0.5  # least such episodes per 1000 ticks
-    # least share of frames with a success event ahead; a failure event, if there are costs only
+    # least share of frames with a success event within the return horizon (failure event, if the
+    # task has no success events)
     event_frames: float = 0.01
     valid_frames: float = 0.2  # least share of frames with a return not cut short by the time limit
     return_std: float = 0.02  # least standard deviation of the return
     one_outcome: float = 0.98  # largest share of episodes with the same outcome
     uniformity: float = 0.7  # least uniformity of an action
-    occupied: float = 0.5  # least share of a hand's grid cells that hold an action
+    occupied: float = 0.5  # least share of occupied cells of the action box, of each hand
     valid_pixels: float = 0.05  # least share of measured pixels; an empty room is mostly far away
     empty_frames: float = 0.25  # largest share of frames without a measured pixel
     balance: float = 0.5  # least share of a task's frames, relative to equal shares
@@ -56,9 +56,9 @@ _LIMITS: Final = CoverageLimits()
 class CoverageConfig:
     """Report event rates, returns, actions, depth and scenes of a dataset, and assess them.
 
-    Reads all columns but depth, of which it samples. Failed checks do not change the exit code.
-    Of a dataset of another robot than the G1, or that egovcp did not collect, it reports the range
-    of every number, and those that are constant; plots are of the G1's datasets only.
+    Reads all columns except depth, and depth of up to 12 episodes per task. Failed checks do not
+    change the exit code. Of a dataset of another robot than the G1, or that egovcp did not collect,
+    it reports the range of every number, and those that are constant, and ignores --returns.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -67,7 +67,9 @@ class CoverageConfig:
     """Folder for the plots events.png, returns.png, actions.png, depth.png (of datasets of the G1
     only); empty: none."""
     json: str = output_file()
-    """File for the statistics and the assessment as JSON; empty: none."""
+    """File for the report: {"tasks": {TASK: statistics}, "assessment": {"suitable", "summary",
+    "checks": [{"passed", "task", "text"}]}}, or {"length_s", "features": {FEATURE: {VALUE:
+    statistics}}, "warnings", "not_assessed"} of another robot or origin; empty: none."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """The Monte Carlo return in the report and the plots."""
 
@@ -82,12 +84,18 @@ class CoverageCheck:
 
 
 def run_coverage(config: CoverageConfig) -> None:
-    """Print statistics and assessment; draw the plots."""
+    """Print statistics and assessment; draw the plots.
+
+    Raises:
+        UsageError: plots of a dataset of another robot or origin, or invalid --returns.
+        DataError: a file is damaged, or a value is not finite.
+    """
     config.returns.check()
     if config.output_dir:
         require_matplotlib()
-    root = locate(config.dataset).root
-    reader = DatasetReader.open(config.dataset) if is_own(root) else None
+    source = locate(config.dataset)
+    root = source.root
+    reader = DatasetReader.open_source(source) if is_own(root) else None
     if reader is None or not reader.robot.is_g1:
         if config.output_dir:
             raise UsageError(
@@ -117,22 +125,23 @@ def run_coverage(config: CoverageConfig) -> None:
     write_report(config.json, {"tasks": tasks, "assessment": assessment})
 
 
-def coverage_column(task: TaskStatistics) -> dict[str, str]:
-    """Statistics of one task: name -> text."""
+def coverage_texts(task: TaskStatistics) -> dict[str, str]:
+    """Statistic -> text, for the report and the card."""
     r, d, length = task.returns, task.depth, task.length
+    spread = r.distribution
     return {
         "episodes": f"{task.episodes}",
-        "frames": f"{task.steps} ({task.step_share:.0%})",
+        "frames": f"{task.frames} ({task.frame_share:.0%})",
         "ticks per episode": f"{length.low:.0f} to {length.high:.0f}" if length else "none",
         "episodes that succeed": f"{task.success_share:.1%}",
         "episodes that end in a fall": f"{task.fall_share:.1%}",
-        f"return (gamma {r.gamma:g}, {r.steps} ticks), mean and std": (
-            f"{r.spread.mean:.3f}, {r.spread.std:.3f}" if r.spread else "none"
+        f"return (gamma {r.gamma:g}, {r.horizon} ticks), mean and std": (
+            f"{spread.mean:.3f}, {spread.std:.3f}" if spread else "none"
         ),
-        "return, 5 % to 95 %": f"{r.spread.q05:.3f} to {r.spread.q95:.3f}" if r.spread else "none",
-        "frames with a success event within the return horizon": f"{r.positive_share:.1%}",
-        "frames with a failure event within the return horizon": f"{r.negative_share:.1%}",
-        "visited cells of the hand workspace": ", ".join(
+        "return, 5 % to 95 %": f"{spread.q05:.3f} to {spread.q95:.3f}" if spread else "none",
+        "frames with a success event within the return horizon": f"{r.success_event_share:.1%}",
+        "frames with a failure event within the return horizon": f"{r.failure_event_share:.1%}",
+        "occupied cells of the action box": ", ".join(
             f"{hand} {share:.0%}" for hand, share in task.action.occupied.items()
         ),
         "depth pixels measured, nearer than 1 m": f"{d.valid_share:.0%}, {d.near_share:.1%}",
@@ -141,10 +150,10 @@ def coverage_column(task: TaskStatistics) -> dict[str, str]:
 
 def _describe(task: TaskStatistics) -> Iterator[str]:
     yield f"{task.task}:"
-    for name, text in coverage_column(task).items():
+    for name, text in coverage_texts(task).items():
         yield f"  {name:54}{text}"
-    yield "  events                    per 1000 ticks, share of episodes"
-    for name, rate in task.events.items():
+    yield "  reward terms and contacts per 1000 ticks, share of episodes"
+    for name, rate in task.term_rates.items():
         yield f"    {name:24}{rate.per_1000_ticks:8.2f}   {rate.episode_share:8.1%}"
     yield "  actions                   uniformity (0 to 1), range of targets in m"
     for name, (low, high) in task.action.workspace_m.items():
@@ -178,7 +187,7 @@ def _checks(
 ) -> Iterator[tuple[bool, str, str]]:
     """(passed, finding, expected finding and advice) of each check of a task."""
     events = task.event_episodes
-    rate = 1000.0 * events / task.steps
+    rate = 1000.0 * events / task.frames
     yield (
         events >= limits.event_episodes and rate >= limits.event_episodes_per_1000,
         f"{events} episodes with an event, {rate:.2f} per 1000 ticks",
@@ -186,10 +195,10 @@ def _checks(
         "collect more, or shorten the episodes",
     )
     kind = "success" if task.has_success_events else "failure"  # if the reward has costs only
+    successes, failures = task.success_event_episodes, task.failure_event_episodes
     yield (
-        task.bad_episodes > 0 and (task.good_episodes > 0 or not task.has_success_events),
-        f"{task.good_episodes} episodes with a success event, {task.bad_episodes} with a failure "
-        "event",
+        failures > 0 and (successes > 0 or not task.has_success_events),
+        f"{successes} episodes with a success event, {failures} with a failure event",
         "at least one of each" if task.has_success_events else "at least one with a failure event",
     )
     success = task.success_share
@@ -200,33 +209,33 @@ def _checks(
     )
     r = task.returns
     yield (
-        r.spread is not None and r.valid_share >= limits.valid_frames,
-        f"{r.valid_share:.0%} of the frames have a return over {r.steps} ticks",
+        r.distribution is not None and r.valid_share >= limits.valid_frames,
+        f"{r.valid_share:.0%} of the frames have a return over {r.horizon} ticks",
         f"at least {limits.valid_frames:.0%}: lengthen the episodes or shorten --returns.steps",
     )
-    if r.spread is not None:
+    if r.distribution is not None:
         yield (
-            r.spread.std >= limits.return_std,
-            f"return {r.spread.mean:.3f} +- {r.spread.std:.3f}",
+            r.distribution.std >= limits.return_std,
+            f"return {r.distribution.mean:.3f} +- {r.distribution.std:.3f}",
             f"a standard deviation of at least {limits.return_std}",
         )
         yield (
-            (r.positive_share if task.has_success_events else r.negative_share)
+            (r.success_event_share if task.has_success_events else r.failure_event_share)
             >= limits.event_frames,
-            f"{r.positive_share:.1%} of the frames have a success event ahead, "
-            f"{r.negative_share:.1%} a failure event",
+            f"{r.success_event_share:.1%} of the frames have a success event ahead, "
+            f"{r.failure_event_share:.1%} a failure event",
             f"at least {limits.event_frames:.0%} with a {kind} event",
         )
     name, uniformity = min(task.action.uniformity.items(), key=lambda item: item[1])
     yield (
         uniformity >= limits.uniformity,
-        f"uniformity of the actions at least {uniformity:.2f} ({name})",
+        f"lowest uniformity of an action: {uniformity:.2f} ({name})",
         f"at least {limits.uniformity}",
     )
     hand, occupied = min(task.action.occupied.items(), key=lambda item: item[1])
     yield (
         occupied >= limits.occupied,
-        f"{occupied:.0%} of the cells of the {hand} hand hold an action",
+        f"fewest occupied cells of the action box: {occupied:.0%} ({hand} hand)",
         f"at least {limits.occupied:.0%}",
     )
     valid, empty = task.depth.valid_share, task.depth.empty_share
@@ -237,8 +246,8 @@ def _checks(
         "camera",
     )
     yield (
-        task.step_share >= least_share,
-        f"{task.step_share:.0%} of the frames",
+        task.frame_share >= least_share,
+        f"{task.frame_share:.0%} of the frames",
         f"at least {least_share:.0%}: collect more of this task",
     )
 
@@ -248,7 +257,7 @@ def _report_features(reader: LeRobotReader) -> dict[str, Any]:
     """Print the coverage and its assessment; returns them, JSON-compatible.
 
     Raises:
-        DataError: a file is damaged.
+        DataError: a file is damaged, or a value is not finite.
     """
     lengths = np.array([row.length for row in reader.rows]) / reader.fps
     features = {
@@ -307,6 +316,11 @@ def _feature_statistics(reader: LeRobotReader) -> dict[str, Statistics]:
                 try:
                     values = values_of(table[feature.key], feature)
                 except DataError as error:
-                    raise DataError.at(path, error.problem or str(error), number) from error
+                    problem = error.problem or str(error)
+                    raise DataError.at(path, problem, number, error.frame) from error
+                nonfinite = nonfinite_problem(values, feature)
+                if nonfinite is not None:
+                    frame, problem = nonfinite
+                    raise DataError.at(path, problem, number, frame)
                 parts[feature.key].append((len(table), describe(values)))
     return {key: aggregate_named(found) for key, found in parts.items() if found}

@@ -98,11 +98,11 @@ def run_split(config: SplitConfig) -> None:
 
 def _open(config: DatasetConfig) -> tuple[DatasetReader | LeRobotReader, int]:
     """A dataset with valid tables, and its number of episodes; prints what is not checked."""
-    root = locate(config).root
-    if is_own(root):
-        own = DatasetReader.open(config)
+    source = locate(config)
+    if is_own(source.root):
+        own = DatasetReader.open_source(source)
         return own, len(own)
-    reader = LeRobotReader.open(root)
+    reader = LeRobotReader.open(source.root)
     echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
     return reader, len(reader.rows)
 

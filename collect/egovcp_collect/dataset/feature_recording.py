@@ -10,10 +10,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from egovcp.data import schema
 from egovcp.data.features import Feature, values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader
 from egovcp.data.pictures import camera_images
-from egovcp.errors import EnvironmentFailure
+from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.files import removed_on_error
 from egovcp.packages import require_packages
 
@@ -27,6 +28,8 @@ def record_features(reader: LeRobotReader, row: EpisodeRow, output: Path) -> lis
     """
     if output.exists():
         raise EnvironmentFailure(f"{output} exists already; choose another --output, or remove it")
+    if "timestamp" not in reader.features:
+        raise DataError.at(reader.root / schema.INFO_PATH, "feature timestamp is missing")
     features = {k: f for k, f in reader.features.items() if f.is_camera or f in reader.numeric}
     if reader.keys("video"):
         require_packages("egovcp", "a dataset with videos", "av")

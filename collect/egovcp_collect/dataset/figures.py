@@ -16,8 +16,8 @@ from egovcp.spec import ACTION_BOX, ACTION_NAMES, ACTION_TERMS, DEPTH_MAX_M, PLA
 from egovcp_collect.dataset.statistics import (
     HISTOGRAM_BINS,
     DatasetStatistics,
-    EventRate,
     TaskStatistics,
+    TermRate,
     events_ahead,
 )
 from egovcp_collect.dataset.task_data import SHOWN_FRAMES, DepthFrames, TaskRows
@@ -70,13 +70,13 @@ def _label(axes: Any, x: str = "", y: str = "", title: str = "", legend: bool = 
 
 
 def _events(tasks: Sequence[TaskStatistics]) -> Any:
-    """Bars of event ticks per 1000 ticks, one panel per task."""
-    bars = max(len(task.events) for task in tasks)
+    """Bars of the rate of each reward term and contact, one panel per task."""
+    bars = max(len(task.term_rates) for task in tasks)
     figure = _figure(4.2 * max(len(tasks), 2), 0.9 + 0.32 * bars)
     for axes, task in zip(figure.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        names = list(task.events)
-        rates = [task.events[name].per_1000_ticks for name in names]
-        colours = [_event_colour(name, task.events[name]) for name in names]
+        names = list(task.term_rates)
+        rates = [task.term_rates[name].per_1000_ticks for name in names]
+        colours = [_event_colour(name, task.term_rates[name]) for name in names]
         axes.barh(range(len(names)), rates, color=colours, height=0.7)
         axes.set_yticks(range(len(names)), names)
         axes.invert_yaxis()
@@ -85,17 +85,18 @@ def _events(tasks: Sequence[TaskStatistics]) -> Any:
         axes.set_xticks([0, 0.1, 1, 10, 100, 1000], ["0", "0.1", "1", "10", "100", "1000"])
         axes.minorticks_off()
         for i, (name, rate) in enumerate(zip(names, rates, strict=True)):
-            event = task.events[name]
+            term = task.term_rates[name]
             number = f"{rate:.0f}" if rate >= 100 else f"{rate:.2f}"
-            text = f" {number}, in {event.episode_share:.0%} of episodes"
-            axes.text(rate, i, text if event.ticks else " never", va="center", fontsize=8)
-        title = f"{task.task}: {task.episodes} episodes, {task.steps} frames"
+            text = f" {number}, in {term.episode_share:.0%} of episodes"
+            axes.text(rate, i, text if term.ticks else " never", va="center", fontsize=8)
+        title = f"{task.task}: {task.episodes} episodes, {task.frames} frames"
         _label(axes, "per 1000 ticks", title=title)
     return figure
 
 
-def _event_colour(name: str, rate: EventRate) -> str:
-    """The colour of a reward term by its sign; costs of actions are neutral."""
+def _event_colour(name: str, rate: TermRate) -> str:
+    """Colour of a reward term by its sign; costs of actions and contacts of the hands are neutral,
+    other contacts failures."""
     if name in ACTION_TERMS:
         return _NEUTRAL
     if name == "touch.other" or rate.sum < 0:
@@ -183,7 +184,8 @@ def _hand_densities(figure: Any, statistics: DatasetStatistics) -> None:
         across, up = 3 * hand + axis, 3 * hand + 2
         edges = [np.linspace(ACTION_BOX.low[i], ACTION_BOX.high[i], 25) for i in (across, up)]
         counts, *_ = np.histogram2d(targets[:, across], targets[:, up], bins=edges)
-        # square roots keep sparse regions visible: the box is short below the neutral pose
+        # Below the neutral pose the box is short, so uniform actions are dense there; the square
+        # root keeps the rest visible.
         axes.pcolormesh(*edges, np.sqrt(counts.T), cmap="Greys", vmin=0)
         axes.plot(palms[:, hand, axis], palms[:, hand, 2], ".", ms=1.2, color="#e8710a", alpha=0.5)
         axes.set_aspect("equal")

@@ -29,7 +29,7 @@ from egovcp.hub import (
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
-from egovcp_collect.dataset.check import progress_bar
+from egovcp_collect.progress import progress_bar
 
 #: Folders of a LeRobot dataset: other files in them on the Hub belong to an earlier version.
 _OWNED: Final = ("data", "meta", "videos", "images", ASSETS)

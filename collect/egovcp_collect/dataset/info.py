@@ -33,7 +33,7 @@ def run_info(config: DatasetInfoConfig) -> None:
     """Print the information."""
     source = locate(config.dataset)
     if is_own(source.root):
-        info = describe(DatasetReader.open(config.dataset))
+        info = describe(DatasetReader.open_source(source))
     else:
         info = describe_other(LeRobotReader.open(source.root), source)
     echo_lines(_table(info))

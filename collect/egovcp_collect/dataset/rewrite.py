@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import shlex
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +30,7 @@ from egovcp.data.parquet import (
 )
 from egovcp.data.paths import files_below
 from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
+from egovcp.data.reader import mistimed
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
@@ -43,12 +46,11 @@ from egovcp_collect.dataset.record_index import (
 )
 from egovcp_collect.dataset.subset import SubsetWriter, scan_episodes
 
-_TIMESTAMP_TOLERANCE_S: Final = 1e-3  # timestamps are float32
-
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """Write the episodes of several datasets to one new dataset; the others are not changed.
+    """Write the episodes of several egovcp datasets to one new dataset; the old ones are not
+    changed.
 
     They must have been collected with the same low-level controller. Each episode is verified
     against its recorded SHA-256, and keeps its metadata."""
@@ -62,7 +64,7 @@ class MergeConfig:
     duplicates: Literal["refuse", "drop"] = "refuse"
     """Whether to refuse or drop an episode whose content equals that of an earlier one."""
     json: str = output_file()
-    """File for the result: {"episodes", "frames", "dropped"}; empty: none."""
+    """File for the result: {"episodes", "frames", "duplicates_dropped"}; empty: none."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +82,22 @@ class RepairConfig:
     """The dataset to repair; a folder."""
     output_dir: str = ""
     """Folder of the new dataset."""
-    records: str = ""
-    """Datasets that the episodes were taken from, separated by commas; episodes are matched by
-    the SHA-256 of their content."""
+    records: list[str] | str = field(default_factory=list)
+    """Datasets that the episodes were taken from, [A, B] or A,B; episodes are matched by the
+    SHA-256 of their content."""
     json: str = output_file()
     """File for the result: {"episodes", "frames", "dropped": [{"file", "episode", "frame",
     "problem"}]}; empty: none."""
 
 
 def run_merge(config: MergeConfig) -> None:
-    """Write the new dataset and print what it holds."""
+    """Write the new dataset and print what it holds.
+
+    Raises:
+        UsageError: fewer than two datasets, or an invalid output folder.
+        DataError: a dataset is damaged or has another controller, or an episode occurs twice.
+        EnvironmentFailure: the Hub cannot be reached, or the output folder cannot be written.
+    """
     if not config.others:
         raise UsageError("merge needs two datasets or more: egovcp-dataset merge A B ...")
     datasets = (config.dataset, *(DatasetConfig(root=other) for other in config.others))
@@ -97,7 +105,9 @@ def run_merge(config: MergeConfig) -> None:
     output = new_folder(config.output_dir, [reader.root for reader in readers])
     require_one_controller({reader.root: reader.controller_id for reader in readers})
     chosen, dropped = _distinct_episodes(readers, config.duplicates)
-    command = shlex.join(["egovcp-dataset", "merge", *(str(reader.root) for reader in readers)])
+    roots = [str(reader.root) for reader in readers]
+    flags = [f"--duplicates={config.duplicates}"] if config.duplicates == "drop" else []
+    command = shlex.join(["egovcp-dataset", "merge", *roots, *flags])
     provenances = [reader.origin for reader in readers]
     with DatasetWriter(output, join_provenance(provenances, command)) as writer:
         for source, index in tqdm(chosen, unit="ep", delay=1):
@@ -105,7 +115,7 @@ def run_merge(config: MergeConfig) -> None:
             joined = join_metadata(episode.metadata, provenances, source)
             writer.add(replace(episode, metadata=joined))
         frames = writer.num_frames
-    result = {"episodes": len(chosen), "frames": frames, "dropped": dropped}
+    result = {"episodes": len(chosen), "frames": frames, "duplicates_dropped": dropped}
     write_report(config.json, result)
     echo(f"{output}: {len(chosen)} episodes, {frames} frames; {dropped} duplicates dropped")
 
@@ -115,7 +125,7 @@ def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
 
     Raises:
         UsageError: it is not given, exists and is not empty, or lies inside one of ``sources``.
-        EnvironmentFailure: it is a mount point.
+        EnvironmentFailure: it is a mount point, or cannot be written.
     """
     if not output_dir:
         raise UsageError("--output_dir is missing; name the folder of the new dataset")
@@ -148,8 +158,8 @@ def _distinct_episodes(
             elif not duplicate.equal:
                 raise DataError(
                     f"{place} is {scenario}, and so is {duplicate.place}, but their content "
-                    "differs: one was altered, or simulated on another machine; leave out one of "
-                    "the datasets"
+                    "differs: one of them was altered, or collected with changed code of the same "
+                    "version; leave out one of the datasets"
                 )
             elif duplicates == "refuse":
                 raise DataError(
@@ -161,24 +171,32 @@ def _distinct_episodes(
 
 
 def run_repair(config: RepairConfig) -> None:
-    """Write the new dataset and print the dropped episodes."""
+    """Write the new dataset and print the dropped episodes.
+
+    Raises:
+        UsageError: no dataset is named, a revision is given, or an invalid output folder.
+        DataError: there are no records, an original is damaged, or no episode can be kept.
+        EnvironmentFailure: the output folder cannot be written.
+    """
     root = local_root(config.dataset)
     require_folder(root)
     output = new_folder(config.output_dir, [root])
-    originals = [
-        Path(os.path.expanduser(name)).absolute() for name in config.records.split(",") if name
-    ]
+    given = config.records.split(",") if isinstance(config.records, str) else config.records
+    originals = [Path(os.path.expanduser(name)).absolute() for name in given if name]
     if not is_own(root) and not originals:
         _repair_other(config, root, output)
         return
-    flags = [f"--records={','.join(map(str, originals))}"] if originals else []
+    flags = [f"--records={json.dumps([*map(str, originals)])}"] if originals else []
     command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
     records = RecordIndex.build(root, originals, command)
+    robot = _recorded_robot(root)
+    assumed = f"; {schema.INFO_PATH} is damaged, so the robot is unknown: the G1 was assumed"
     dropped: list[DataError] = []
     with DatasetWriter(output, records.provenance) as writer:
-        for episode in tqdm(_valid_episodes(root, records, dropped), unit="ep", delay=1):
+        episodes = _valid_episodes(root, robot or G1, records, dropped)
+        for episode in tqdm(episodes, unit="ep", delay=1):
             writer.add(episode)
-        result = _report(config, root, writer, dropped)
+        result = _report(config, root, writer, dropped, "" if robot else assumed)
     echo(f"{output}: {result}")
 
 
@@ -190,8 +208,10 @@ def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
         for found in scan_episodes(reader):
             if isinstance(found, DataError):
                 dropped.append(found)
-            else:
-                writer.add(found)
+                continue
+            writer.add(found)
+            if error := found.length_problem:
+                echo(one_line(f"kept: {error}"))
         echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
         result = _report(config, root, writer, dropped)
         writer.finish()
@@ -203,27 +223,40 @@ def _report(
     root: Path,
     writer: DatasetWriter | SubsetWriter,
     dropped: list[DataError],
+    note: str = "",
 ) -> str:
-    """Print the problems, write the report and return a summary; raises `DataError` if no episode
-    is kept, so that the unfinished dataset is removed."""
+    """Print the problems, write the report and return a summary.
+
+    Raises:
+        DataError: no episode is kept, with ``note``; the unfinished dataset is removed.
+    """
     kept, frames = writer.num_episodes, writer.num_frames
     for error in dropped:
         echo(one_line(f"dropped: {error}"))
     problems = [problem_as_json(error, root) for error in dropped]
     write_report(config.json, {"episodes": kept, "frames": frames, "dropped": problems})
     if not kept:
-        raise DataError(f"no episode of {root} can be kept; {len(dropped)} problem(s), see above")
+        count = f"{len(dropped)} problem(s), see above"
+        raise DataError(f"no episode of {root} can be kept; {count}{note}")
     lost = len({error.episode for error in dropped} - {None})
     return f"{kept} episodes, {frames} frames; dropped {lost} episodes ({len(dropped)} problems)"
 
 
+def _recorded_robot(root: Path) -> RobotSpec | None:
+    """The robot of a dataset; None if ``info.json`` is damaged."""
+    try:
+        return metadata.load_robot(metadata.load_v3_info(root), root / schema.INFO_PATH)
+    except DataError:
+        return None
+
+
 def _valid_episodes(
-    root: Path, records: RecordIndex, dropped: list[DataError]
+    root: Path, robot: RobotSpec, records: RecordIndex, dropped: list[DataError]
 ) -> Iterator[Episode]:
     """Each valid episode once; the errors of the others are appended to ``dropped``."""
     seen: set[int | None] = set()
     finder, scenarios = DuplicateFinder[int](), ScenarioKeys(records.provenance)
-    for found in _read_data_files(root):
+    for found in _read_data_files(root, robot):
         if isinstance(found, DataError):
             dropped.append(found)
             seen.add(found.episode)
@@ -236,17 +269,29 @@ def _valid_episodes(
             dropped.append(DataError.at(path, error.problem, index, error.frame))
         else:
             yield valid
-    for index in sorted(set(range(records.recorded)) - seen):
-        dropped.append(DataError.at(_data_path(root, index), "cannot be read", index))
+    dropped += _lost_episodes(root, sorted(set(range(records.recorded)) - seen))
 
 
-def _read_data_files(root: Path) -> Iterator[tuple[Path, int, Episode] | DataError]:
-    """File, ``episode_index`` and content of each episode in the data files, independent of most of
-    `meta`, and an error for each unreadable part."""
-    try:
-        robot = metadata.load_robot(metadata.load_v3_info(root), root / schema.INFO_PATH)
-    except DataError:
-        robot = G1
+def _lost_episodes(root: Path, indices: Sequence[int]) -> list[DataError]:
+    """An error for each of these episodes, with the file that should hold it if `meta` is valid,
+    else the data folder."""
+    reader: DatasetReader | None = None
+    if indices:
+        with suppress(DataError):
+            reader = DatasetReader(Source(root, ""))
+    count = len(reader) if reader else 0
+    paths = [reader.data_path(i) if reader and i < count else root / "data" for i in indices]
+    return [
+        DataError.at(path, "cannot be read", index)
+        for path, index in zip(paths, indices, strict=True)
+    ]
+
+
+def _read_data_files(
+    root: Path, robot: RobotSpec
+) -> Iterator[tuple[Path, int, Episode] | DataError]:
+    """File, ``episode_index`` and content of each episode in the data files, and an error for each
+    unreadable part; `meta` is not read."""
     for path in files_below(root / "data"):
         if path.suffix == ".parquet":
             try:
@@ -272,8 +317,8 @@ def _assembled(path: Path, table: pa.Table, robot: RobotSpec) -> Episode:
     with data_errors(path):
         columns = read_columns(table, schema.FEATURES, robot)
     frames = np.arange(len(table))
-    late = np.abs(columns["timestamp"] - frames / robot.planner_hz)
-    wrong = (columns["frame_index"] != frames) | ~(late <= _TIMESTAMP_TOLERANCE_S)
+    wrong_time = mistimed(columns["timestamp"], robot.planner_hz)
+    wrong = (columns["frame_index"] != frames) | wrong_time
     if wrong.any():
         problem = f"its frame indices or timestamps do not count at {robot.planner_hz} Hz from 0"
         raise DataError.without_place(problem, int(np.argmax(wrong)))
@@ -309,11 +354,3 @@ def _validated(
     if duplicate is not None:
         raise DataError.without_place(duplicate.problem(scenario))
     return episode
-
-
-def _data_path(root: Path, index: int) -> Path:
-    """The file that should hold an episode, or the data folder if that is unknown."""
-    try:
-        return DatasetReader(Source(root, "")).data_path(index)
-    except (DataError, IndexError):
-        return root / "data"

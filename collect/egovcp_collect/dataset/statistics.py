@@ -1,9 +1,9 @@
 """Statistics of a dataset per task: events, returns, actions, drawn parameters, depth.
 
 A *success event* is a frame with a positive value, a *failure event* one with a negative value in a
-column of `spec.REWARD_TERMS` other than `spec.ACTION_TERMS`. In datasets of earlier versions, which
+column of `spec.REWARD_TERMS` other than `spec.ACTION_TERMS`. In episodes of earlier versions, which
 lack these columns, it is a frame whose reward differs from the task's median reward by more than
-`EVENT_REWARD`.
+`spec.EVENT_REWARD`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from egovcp.data import DatasetReader, ReturnConfig
 from egovcp.data.provenance import SOURCE
 from egovcp.errors import UsageError
-from egovcp.sim.tasks import task_entries
-from egovcp.spec import ACTION_BOX, ACTION_NAMES, ACTION_TERMS, REWARD_TERMS
+from egovcp.sim.tasks.registry import installed_task
+from egovcp.spec import ACTION_BOX, ACTION_NAMES, ACTION_TERMS, EVENT_REWARD, REWARD_TERMS
 from egovcp_collect.dataset.task_data import (
     DepthStatistics,
     TaskRows,
@@ -31,8 +31,7 @@ from egovcp_collect.dataset.task_data import (
 )
 
 _EVENT_COLUMNS: Final = [i for i, name in enumerate(REWARD_TERMS) if name not in ACTION_TERMS]
-_SUCCESS_COLUMNS: Final = {"block", "pass"}  # in which a task stores its rewards; see `Task.terms`
-EVENT_REWARD: Final = 0.08  # events count 1, the costs of pose and action rate at most 0.07
+_SUCCESS_COLUMNS: Final = {"block", "pass"}  # columns of positive terms; see `BaseTask.terms`
 HISTOGRAM_BINS: Final = 40
 """Bins of an action's histogram, over [-1, 1]."""
 GRID_CELLS: Final = 8
@@ -65,8 +64,8 @@ class Distribution:
 
 
 @dataclass(frozen=True)
-class EventRate:
-    """How often an event occurred."""
+class TermRate:
+    """How often a reward term was not 0, or a contact occurred."""
 
     ticks: int
     per_1000_ticks: float
@@ -80,22 +79,24 @@ class ReturnStatistics:
     """Monte Carlo returns of the frames that have one."""
 
     gamma: float
-    steps: int  # horizon K, planner ticks
+    horizon: int  # planner ticks
     valid_share: float  # frames whose return the time limit does not cut short
-    spread: Distribution | None
-    positive_share: float  # valid frames with a success event within the horizon
-    negative_share: float  # valid frames with a failure event within the horizon
+    distribution: Distribution | None  # of the valid returns; None if there are none
+    success_event_share: float  # valid frames with a success event within the horizon
+    failure_event_share: float  # valid frames with a failure event within the horizon
 
 
 @dataclass(frozen=True)
 class ActionStatistics:
-    """Which part of the action box N actions fill, and how evenly."""
+    """Coverage of the action box by N actions, and uniformity of each action."""
 
-    histogram: dict[str, list[int]]  # action name -> frames per bin
+    histogram: dict[str, list[int]]
+    """Action name -> frames per bin."""
     uniformity: dict[str, float]
     """Action name -> overlap of its histogram p over n bins with the uniform one, sum of
     min(p_i, 1 / n): 1 is uniform, 1 / n is a single bin."""
-    occupied: dict[str, float]  # hand -> share of the grid cells that hold an action
+    occupied: dict[str, float]
+    """Hand -> share of occupied cells of the action box: grid cells that contain an action."""
     workspace_m: dict[str, tuple[float, float]]
     """Action name -> lowest and highest target, m, pelvis heading frame (height: above
     ground)."""
@@ -131,18 +132,18 @@ class TaskStatistics:
 
     task: str
     episodes: int
-    steps: int  # frames
-    step_share: float  # of the dataset's frames
-    length: Distribution | None  # ticks per episode
+    frames: int
+    frame_share: float  # of the dataset's frames
+    length: Distribution | None  # frames per episode
     success_share: float
     fall_share: float
     event_episodes: int  # with a success or failure event
-    good_episodes: int  # with a success event
-    bad_episodes: int  # with a failure event
+    success_event_episodes: int
+    failure_event_episodes: int
     has_success_events: bool
     """Whether the data has a success event, or the installed task rewards one; False if the reward
     has costs only."""
-    events: dict[str, EventRate]
+    term_rates: dict[str, TermRate]
     """Rate of each reward term, and of ``touch.hands`` and ``touch.other``, ticks of contact with
     the task's object, where they were recorded."""
     reward: Distribution | None
@@ -163,7 +164,7 @@ class DatasetStatistics:
 
 
 def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetStatistics:
-    """Read the columns of a dataset, and sampled episodes.
+    """Statistics of each task of a dataset, from all columns but depth and from sampled episodes.
 
     Raises:
         DataError: a file is damaged.
@@ -171,8 +172,8 @@ def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetS
     """
     if not reader.robot.is_g1:
         raise UsageError(
-            f"{reader.root} is of robot {reader.robot.robot_type}: statistics of hands, and cards "
-            "with them, are those of the G1; use `egovcp-dataset info` and `check`"
+            f"{reader.root} is of robot {reader.robot.robot_type}: statistics and cards are "
+            "available for the G1 only; use `egovcp-dataset info` and `check`"
         )
     rows = read_rows(reader, returns)
     samples = [sample_episodes(reader, task) for task in rows]
@@ -188,16 +189,16 @@ def _task_statistics(
     return TaskStatistics(
         task=rows.task,
         episodes=len(rows.length),
-        steps=len(rows.reward),
-        step_share=len(rows.reward) / frames,
+        frames=len(rows.reward),
+        frame_share=len(rows.reward) / frames,
         length=Distribution.of(rows.length),
         success_share=float(rows.success.mean()),
         fall_share=float(rows.fallen.mean()),
         event_episodes=int((success | failure).sum()),
-        good_episodes=int(success.sum()),
-        bad_episodes=int(failure.sum()),
+        success_event_episodes=int(success.sum()),
+        failure_event_episodes=int(failure.sum()),
         has_success_events=bool(success.any()) or _rewards_success(rows.task),
-        events=_event_rates(rows),
+        term_rates=_term_rates(rows),
         reward=Distribution.of(rows.reward),
         returns=_return_statistics(rows, returns),
         action=ActionStatistics.of(rows.action),
@@ -208,11 +209,11 @@ def _task_statistics(
 
 def _rewards_success(task: str) -> bool:
     """Whether the task is installed and has a reward term of a success."""
-    known = {entry.name: entry.task for entry in task_entries()}.get(task)
+    known = installed_task(task)
     return known is not None and not _SUCCESS_COLUMNS.isdisjoint(known.terms.values())
 
 
-def _event_rates(rows: TaskRows) -> dict[str, EventRate]:
+def _term_rates(rows: TaskRows) -> dict[str, TermRate]:
     """Name of each reward term, and ``touch.<group>`` of each contact -> rate."""
     found: dict[str, list[tuple[int, float]]] = {}  # name -> ticks and sum in each episode
     for metadata in rows.metadata:
@@ -223,7 +224,7 @@ def _event_rates(rows: TaskRows) -> dict[str, EventRate]:
     rates = {}
     for name, parts in found.items():
         ticks, episodes = sum(t for t, _ in parts), sum(t > 0 for t, _ in parts)
-        rates[name] = EventRate(
+        rates[name] = TermRate(
             ticks,
             1000.0 * ticks / len(rows.reward),
             episodes,
@@ -238,11 +239,11 @@ def _return_statistics(rows: TaskRows, config: ReturnConfig) -> ReturnStatistics
     success, failure = events_ahead(rows, config.steps)
     return ReturnStatistics(
         gamma=config.gamma,
-        steps=config.steps,
+        horizon=config.steps,
         valid_share=float(valid.mean()),
-        spread=Distribution.of(rows.mc_return[valid]),
-        positive_share=float(success[valid].mean()) if valid.any() else 0.0,
-        negative_share=float(failure[valid].mean()) if valid.any() else 0.0,
+        distribution=Distribution.of(rows.mc_return[valid]),
+        success_event_share=float(success[valid].mean()) if valid.any() else 0.0,
+        failure_event_share=float(failure[valid].mean()) if valid.any() else 0.0,
     )
 
 
@@ -262,15 +263,18 @@ def events_ahead(rows: TaskRows, steps: int) -> tuple[NDArray[np.bool_], NDArray
 
 def _events(rows: TaskRows) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(N,) and (N,): whether a frame has a success event, and a failure event."""
-    values, threshold = rows.reward_terms[:, _EVENT_COLUMNS], 0.0
-    if not rows.reward_terms.any():  # not recorded
-        values, threshold = (rows.reward - np.median(rows.reward))[:, None], EVENT_REWARD
-    success, failure = values > threshold, values < -threshold
-    return np.any(success, axis=1), np.any(failure, axis=1)
+    recorded = np.logical_or.reduceat(rows.reward_terms.any(axis=1), rows.start)
+    recorded = np.repeat(recorded, rows.length)
+    terms = rows.reward_terms[:, _EVENT_COLUMNS]
+    change = rows.reward - np.median(rows.reward)
+    success = np.where(recorded, np.any(terms > 0, axis=1), change > EVENT_REWARD)
+    failure = np.where(recorded, np.any(terms < 0, axis=1), change < -EVENT_REWARD)
+    return success, failure
 
 
 def drawn_parameters(metadata: Sequence[Mapping[str, Any]]) -> dict[str, Distribution]:
-    """Dotted name of each scene and randomisation parameter -> distribution over the episodes."""
+    """Dotted name of each numeric scene and randomisation parameter -> distribution over the
+    episodes; lists and text are left out."""
     drawn = {}
     for name, column in pd.json_normalize([dict(episode) for episode in metadata]).items():
         numbers = [x for x in column if isinstance(x, int | float) and not math.isnan(x)]

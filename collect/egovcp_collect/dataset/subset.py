@@ -27,11 +27,13 @@ from egovcp.data.features import Feature
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
 from egovcp.data.pictures import decode_frames, decode_image, frame_times
-from egovcp.data.stats import QUANTILES, aggregate_named
+from egovcp.data.stats import QUANTILES, ROWS, aggregate_named
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError
 
 _SAMPLED_FRAMES: Final = 20  # for the statistics of a camera that are not recorded
+_MOMENTS: Final = ROWS[: -len(QUANTILES)]
+_QUANTILE_ROWS: Final = ROWS[-len(QUANTILES) :]
 
 
 type Spans = Mapping[int, Mapping[str, VideoSpan]]
@@ -40,13 +42,23 @@ type Spans = Mapping[int, Mapping[str, VideoSpan]]
 
 @dataclass(frozen=True)
 class ValidEpisode:
-    """An episode without a problem."""
+    """An episode whose rows have no problem."""
 
     row: EpisodeRow
+    """Its row in ``meta/episodes``; without columns if that does not list it."""
     table: pa.Table
     """Its rows, with all columns."""
     values: dict[str, NDArray[Any]]
     """Its numbers and strings, (T, n) of each feature."""
+
+    @property
+    def length_problem(self) -> DataError | None:
+        """An error if ``meta/episodes`` lists it with another number of frames."""
+        listed, found = self.row.length, len(self.table)
+        if listed == found or not self.row.columns:
+            return None
+        problem = f"meta/episodes gives it {listed} frames, but it has {found}"
+        return DataError.at(self.row.data_path, problem, self.row.index)
 
 
 def scan_episodes(reader: LeRobotReader) -> Iterator[ValidEpisode | DataError]:
@@ -56,6 +68,9 @@ def scan_episodes(reader: LeRobotReader) -> Iterator[ValidEpisode | DataError]:
     position of an unlisted episode if the videos hold exactly the frames of all episodes.
     """
     check = LeRobotCheck(reader, every=True)
+    if missing := list(check.index_feature_problems()):
+        yield from missing
+        return
     columns = [k for k, f in reader.features.items() if f.dtype != "video"]
     spans = cache(partial(_rebuilt_spans, reader))
     reader.tasks = reader.tasks or _named_tasks(reader)
@@ -68,7 +83,10 @@ def scan_episodes(reader: LeRobotReader) -> Iterator[ValidEpisode | DataError]:
                 continue
             number, table = part
             if number in seen:
-                problem = "an earlier episode has the same episode_index"
+                problem = (
+                    "it has rows in another place: they are not together, or its episode_index is "
+                    "repeated"
+                )
                 yield DataError.at(path, problem, number)
                 continue
             seen.add(number)
@@ -91,6 +109,10 @@ def _examine(
         problem = "meta/episodes does not list it, and the videos do not tell where it is"
         yield DataError.at(path, f"{problem} in {missing[0]}", number)
         return
+    if not check.reader.tasks:
+        problem = f"{schema.TASKS_PATH} and meta/episodes are lost, or name no task"
+        yield DataError.at(path, f"no text of its task is known: {problem}", number)
+        return
     check.by_number[number] = row
     for found in check.episode_problems(path, number, table):
         if isinstance(found, DataError):
@@ -105,8 +127,11 @@ def _named_tasks(reader: LeRobotReader) -> dict[int, str]:
     tasks: dict[int, str] = {}
     for path in reader.data_files:
         for part in reader.episodes(path, ["task_index"]):
-            if not isinstance(part, DataError) and part[0] in named and len(part[1]):
-                tasks.setdefault(part[1]["task_index"][0].as_py(), named[part[0]])
+            if isinstance(part, DataError):
+                continue
+            number, table = part
+            if number in named and "task_index" in table.column_names:
+                tasks.setdefault(table["task_index"][0].as_py(), named[number])
     return tasks
 
 
@@ -199,7 +224,9 @@ class SubsetWriter:
         frame.to_parquet(self._folder / schema.TASKS_PATH)
         path = self._folder / schema.EPISODES_PATH.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True)
-        names = dict.fromkeys(name for row in self._rows for name in row)
+        in_all = {f"stats/{key}/{name}" for key, found in stats.items() for name in found}
+        columns = dict.fromkeys(name for row in self._rows for name in row)
+        names = [n for n in columns if not n.startswith("stats/") or n in in_all]
         rows = [{name: row.get(name) for name in names} for row in self._rows]
         pq.write_table(pa.Table.from_pylist(rows), path)
 
@@ -223,7 +250,7 @@ class SubsetWriter:
             "episode_index": number,
             "tasks": [reader.tasks[task] for task in tasks],
             "length": count,
-            **_numbers(reader.info["data_path"], path, "data"),
+            **_file_indices(reader.info["data_path"], path, "data"),
             "dataset_from_index": self.num_frames,
             "dataset_to_index": self.num_frames + count,
             **{f"meta/episodes/{name}": 0 for name in ("chunk_index", "file_index")},
@@ -231,7 +258,7 @@ class SubsetWriter:
         for key, span in old.videos.items():
             name = span.path.relative_to(reader.root).as_posix()
             template = str(reader.info["video_path"]).replace("{video_key}", key)
-            row |= _numbers(template, name, f"videos/{key}")
+            row |= _file_indices(template, name, f"videos/{key}")
             row[f"videos/{key}/from_timestamp"] = span.start_s
             row[f"videos/{key}/to_timestamp"] = span.start_s + count / reader.fps
         for key, feature in reader.features.items():
@@ -245,13 +272,13 @@ class SubsetWriter:
     def _statistics(
         self, episode: ValidEpisode, feature: Feature, number: int
     ) -> tuple[int, Statistics]:
-        """Number of frames, and statistics; none of strings. Those of cameras are as recorded, or
-        of some frames."""
+        """(number of frames, statistics) of a feature. Strings have none. Those of cameras are the
+        recorded ones, or computed from up to 20 frames."""
         key, count = feature.key, len(episode.table)
         if feature.is_camera:
-            recorded = dict(episode.row.stats(key))
+            recorded = {k: v for k, v in episode.row.stats(key).items() if v is not None}
             frames = (recorded.pop("count", None) or [count])[0]
-            if recorded and None not in recorded.values():
+            if recorded.keys() >= {*_MOMENTS}:  # one converted from v2.1 has no quantiles
                 return frames, {name: np.array(v, np.float64) for name, v in recorded.items()}
             return _camera_statistics(episode, feature, self._reader.fps)
         if key not in episode.values or not feature.is_numeric:
@@ -265,9 +292,8 @@ class SubsetWriter:
 
 
 def _with_quantiles(values: NDArray[Any]) -> Statistics:
-    found = np.quantile(values.astype(np.float64), QUANTILES, axis=0)
-    names = (f"q{round(100 * q):02d}" for q in QUANTILES)
-    return {**describe(values), **dict(zip(names, found, strict=True))}
+    quantiles = np.quantile(values.astype(np.float64), QUANTILES, axis=0)
+    return {**describe(values), **dict(zip(_QUANTILE_ROWS, quantiles, strict=True))}
 
 
 def _camera_statistics(
@@ -293,8 +319,8 @@ def _camera_statistics(
     return len(images), {name: value[:, None, None] for name, value in stats.items()}
 
 
-def _numbers(template: str, path: str, prefix: str) -> dict[str, int]:
-    """Columns with the chunk and file index of a file name of the template."""
+def _file_indices(template: str, path: str, prefix: str) -> dict[str, int]:
+    """`{prefix}/chunk_index` and `{prefix}/file_index` of ``path``, which follows ``template``."""
     pattern = re.escape(template)
     for name in ("chunk_index", "file_index"):
         pattern = re.sub(rf"\\\{{{name}(:[^}}]*)?\\\}}", rf"(?P<{name}>\\d+)", pattern, count=1)
@@ -309,7 +335,8 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
     episodes and frames.
 
     Raises:
-        DataError: one of them has a problem, or the dataset's episodes are not numbered 0 to N - 1.
+        DataError: one of them has a problem, a part of a file is unreadable, or the dataset's
+            episodes are not numbered 0 to N - 1.
     """
     if [row.index for row in reader.rows] != list(range(len(reader.rows))):
         problem = "its episodes are not numbered from 0 without gaps"
@@ -318,10 +345,10 @@ def write_subset(reader: LeRobotReader, episodes: Sequence[int], root: Path) -> 
     with new_dataset(root) as folder:
         writer = SubsetWriter(reader, folder)
         for found in scan_episodes(reader):
-            if isinstance(found, DataError):
-                if found.episode is None or found.episode in wanted:
-                    raise DataError(f"{found}; `egovcp-dataset repair` keeps the valid episodes")
-            elif found.row.index in wanted:
+            error = found if isinstance(found, DataError) else found.length_problem
+            if error is not None and (error.episode is None or error.episode in wanted):
+                raise DataError(f"{error}; `egovcp-dataset repair` keeps the valid episodes")
+            if isinstance(found, ValidEpisode) and found.row.index in wanted:
                 writer.add(found)
         writer.finish()
     return writer.num_episodes, writer.num_frames

@@ -10,9 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.data import DatasetReader, Episode, ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.checks.lerobot_episode import nonfinite_problem
+from egovcp.data import (
+    DatasetReader,
+    Episode,
+    ReturnConfig,
+    is_terminal,
+    mc_return,
+    mc_valid,
+    schema,
+)
+from egovcp.data.features import parse_feature
+from egovcp.data.parquet import Columns
+from egovcp.errors import DataError
 from egovcp.robot.kinematics import palm_positions
-from egovcp.sim.tasks import Task, task_entries
+from egovcp.sim.tasks import Task
+from egovcp.sim.tasks.registry import installed_task
 
 _COLUMNS: Final = (
     spec.ACTION_KEY,
@@ -55,9 +68,10 @@ def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
     """The rows of each task in the dataset, in the order of their first episodes.
 
     Raises:
-        DataError: a file is damaged.
+        DataError: a file is damaged, or a value is not finite.
     """
     columns = reader.read_columns(_COLUMNS)
+    _require_finite(reader, columns)
     tasks = np.array([reader.task(i) for i in range(len(reader))])
     found = []
     for task in dict.fromkeys(tasks.tolist()):
@@ -89,6 +103,19 @@ def read_rows(reader: DatasetReader, returns: ReturnConfig) -> list[TaskRows]:
             )
         )
     return found
+
+
+def _require_finite(reader: DatasetReader, columns: Columns) -> None:
+    """Raise `DataError` for the first value of ``columns``, (N, ...), that is not finite."""
+    for key, values in columns.items():
+        feature = parse_feature(key, schema.feature_of(key, reader.robot))
+        found = nonfinite_problem(values.reshape(len(values), -1), feature)
+        if found is not None:
+            row, problem = found
+            ends = reader.lengths.cumsum()
+            episode = int(np.searchsorted(ends, row, side="right"))
+            frame = row - int(ends[episode] - reader.lengths[episode])
+            raise DataError.at(reader.data_path(episode), problem, episode, frame)
 
 
 @dataclass(frozen=True)
@@ -159,7 +186,7 @@ def sample_episodes(reader: DatasetReader, rows: TaskRows) -> TaskSample:
 def _event_frames(episode: Episode, index: int) -> DepthFrames:
     """Up to `SHOWN_FRAMES` images from the event on; from the start if there is none."""
     first = min(episode.metadata.get("event_tick") or 0, len(episode) - 1)
-    known = {entry.name: entry.task for entry in task_entries()}.get(episode.task)
-    last = min(first + (known or Task).event_duration_ticks, len(episode) - 1)
+    task = installed_task(episode.task) or Task
+    last = min(first + task.event_duration_ticks, len(episode) - 1)
     tick = np.unique(np.rint(np.linspace(first, last, SHOWN_FRAMES)).astype(np.int64))
     return DepthFrames(index, tick, episode.depth[tick])

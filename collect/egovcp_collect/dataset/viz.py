@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.lerobot import LeRobotReader, is_own
-from egovcp.data.source import locate
+from egovcp.data.source import locate, locate_on_demand
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
 from egovcp.log.tick import Sink
@@ -24,33 +24,46 @@ from egovcp.terminal import echo
 class VizConfig:
     """Write an episode as a Rerun or MCAP recording.
 
-    It shows depth, the robot's pose, hand targets, actions, rewards and state.
-
-    The pelvis pose is not part of a dataset: the robot is drawn at the origin, at its commanded
-    height, tilted as its IMU measured. Of a LeRobot v3 dataset that egovcp did not collect, the
-    recording shows the images and a curve of every number.
+    It shows depth, actions, rewards and state. Of the G1 it also shows the robot's pose and the
+    hand targets; the pelvis pose is not part of a dataset, so the robot is drawn at the origin, at
+    its commanded height, tilted as its IMU measured. Of a LeRobot v3 dataset that egovcp did not
+    collect, it shows the images and a curve of every number.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """The dataset: a folder, or an id of the Hub."""
+    """The dataset: a folder, or an id of the Hub, of which only the file of the episode is
+    downloaded, but the whole dataset if egovcp did not collect it."""
     episode: int = 0
     """Index of the episode, counted from 0."""
     output: str = output_file()
     """Recording to create; empty: NAME-episode-N.rrd in the current folder. A name that ends in
-    .mcap: MCAP, as egovcp-deploy writes and replays it."""
+    .mcap: MCAP, as egovcp-deploy writes and replays it, of datasets that egovcp collected."""
     spawn: bool = False
     """Open the recording in the Rerun viewer."""
 
 
 def run_viz(config: VizConfig) -> None:
-    """Write the recording."""
+    """Write the recording.
+
+    Raises:
+        UsageError: there is no such episode, or MCAP is asked for a dataset of another origin.
+        DataError: the dataset or the episode is damaged.
+        EnvironmentFailure: a package is missing, the Hub cannot be reached, or the recording
+            exists or cannot be written.
+    """
     require_packages("egovcp-collect", "the recording", "mcap", "rerun")
-    source = locate(config.dataset)
+    source, cache = locate_on_demand(config.dataset)
     reader: DatasetReader | LeRobotReader
-    if is_own(source.root) or config.output.endswith(".mcap"):
-        reader = DatasetReader.open(config.dataset)
+    if is_own(source.root):
+        reader = DatasetReader.open_source(source, cache)
         count = len(reader)
+    elif Path(config.output).suffix == ".mcap":
+        raise UsageError(
+            f"--output={config.output}: MCAP needs a dataset that egovcp collected; name a .rrd"
+        )
     else:
+        if cache is not None:
+            source = locate(replace(config.dataset, revision=source.commit))
         reader = LeRobotReader.open(source.root)
         count = len(reader.rows)
     if not 0 <= config.episode < count:
@@ -62,7 +75,7 @@ def run_viz(config: VizConfig) -> None:
     require_writable(output.parent)
     if isinstance(reader, DatasetReader):
         write_recording(reader, config.episode, output)
-        echo(f"wrote {output}; {POSE}")
+        echo(f"wrote {output}; {POSE}" if reader.robot.is_g1 else f"wrote {output}")
     else:
         from egovcp_collect.dataset.feature_recording import record_features
 
@@ -76,7 +89,12 @@ def run_viz(config: VizConfig) -> None:
 
 
 def write_recording(reader: DatasetReader, index: int, output: Path, meshes: bool = True) -> None:
-    """Write episode ``index`` as the new recording ``output``: MCAP by its name, else Rerun."""
+    """Write episode ``index`` as the new recording ``output``: MCAP by its name, else Rerun.
+
+    Raises:
+        DataError: the episode is damaged.
+        EnvironmentFailure: ``output`` exists.
+    """
     from egovcp.log.mcap import McapSink
     from egovcp.log.rerun import RerunSink
 

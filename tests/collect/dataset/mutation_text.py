@@ -8,13 +8,7 @@ from typing import Any, Final
 from egovcp import spec
 from tests.support.policy_mutations.editing import Random, pick, wrong_encodings
 
-from . import damage as d
-from .damage import (
-    COLLECTION,
-    HASHES,
-    INFO,
-    STATS,
-)
+from .damage import COLLECTION, HASHES, INFO, STATS, edit, info
 from .mutation_editing import (
     JSON_FILES,
     Mutate,
@@ -73,7 +67,7 @@ WRONG: Final[list[Any]] = [
 
 
 def _other(rng: Random, value: object) -> Any:
-    """A value of another type or out of any range."""
+    """A value of `WRONG` of another type, or an integer, that differs from `value`."""
     wrong = [v for v in WRONG if type(v) is not type(value) or isinstance(v, int)]
     return pick(rng, [v for v in wrong if v != value])
 
@@ -90,12 +84,12 @@ def _change_info(root: Path, rng: Random) -> str:
             group, key = feature, pick(rng, ["dtype", "shape", "names"])
         group[key] = _other(rng, group[key])
 
-    d.edit(INFO, change)(root)
+    edit(INFO, change)(root)
     settle_hashes(root, rng)
     return INFO
 
 
-def _leave_the_folder(root: Path, rng: Random) -> str:
+def _change_data_path(root: Path, rng: Random) -> str:
     paths = [
         "../../etc/passwd",
         "/etc/passwd",
@@ -108,7 +102,7 @@ def _leave_the_folder(root: Path, rng: Random) -> str:
         "data/\0.parquet",
         "data/chunk-{chunk_index:03d}/file-{chunk_index:03d}.parquet",
     ]
-    d.info(data_path=pick(rng, paths))(root)
+    info(data_path=pick(rng, paths))(root)
     settle_hashes(root, rng)
     return f"{INFO}|data/"
 
@@ -119,7 +113,7 @@ def _change_a_record(root: Path, rng: Random) -> str:
         key = pick(rng, ["task", "time_limit", "sha256", "metadata", "length"])
         record[key] = _other(rng, record[key])
 
-    d.edit(COLLECTION, change)(root)
+    edit(COLLECTION, change)(root)
     settle_hashes(root, rng)
     return f"{COLLECTION}|data/"
 
@@ -129,18 +123,18 @@ def _change_the_provenance(root: Path, rng: Random) -> str:
 
     def change(content: dict[str, Any]) -> None:
         key = pick(rng, names)
-        # another seed, command or an empty object is a valid one
+        # A value of the same type, or null, can be valid.
         wrong = [v for v in WRONG if type(v) is not type(content[key]) and v is not None]
         content[key] = pick(rng, wrong)
 
-    d.edit(COLLECTION, change)(root)
+    edit(COLLECTION, change)(root)
     settle_hashes(root, rng)
     return COLLECTION
 
 
 def _change_the_sources(root: Path, rng: Random) -> str:
     wrong: list[Any] = [3, "x", {"a": 1}, [3], ["x"], [{}], [{"controller_id": 3}], [None]]
-    d.edit(COLLECTION, lambda c: c["config"].update(sources=pick(rng, wrong)))(root)
+    edit(COLLECTION, lambda c: c["config"].update(sources=pick(rng, wrong)))(root)
     settle_hashes(root, rng)
     return COLLECTION
 
@@ -152,7 +146,7 @@ def _change_statistics(root: Path, rng: Random) -> str:
         values = [_other(rng, feature[key]), [1e300], [10**400], ["0.5"], [True], None]
         feature[key] = pick(rng, values)
 
-    d.edit(STATS, change)(root)
+    edit(STATS, change)(root)
     settle_hashes(root, rng)
     return STATS
 
@@ -164,7 +158,7 @@ TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
     _write_json_in_another_encoding,
     _write_something_else_than_an_object,
     _change_info,
-    _leave_the_folder,
+    _change_data_path,
     _change_a_record,
     _change_the_provenance,
     _change_the_sources,

@@ -1,4 +1,4 @@
-"""Episodes whose events, returns and outcomes are known."""
+"""Episodes whose events, returns and outcomes are known, and another robot."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
+from egovcp.robot_spec import RobotSpec
 from egovcp_collect.config import CollectConfig
 
 LENGTH = 80
@@ -18,6 +19,18 @@ SETTINGS = Provenance(
     command="egovcp-collect --task=ball --note='a|b'",
     versions={"mujoco": "3.11.0"},
     config=draccus.encode(CollectConfig()),
+)
+
+
+#: Another robot than the G1.
+ARM = RobotSpec(
+    robot_type="arm",
+    depth=(32, 48),
+    depth_max_m=1.5,
+    planner_hz=20,
+    state_names=("angle.a", "angle.b"),
+    action_names=("a", "b"),
+    action_box=spec.ActionBox((-1.0, -2.0), (0.0, 0.0), (1.0, 2.0)),
 )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -86,6 +87,25 @@ def test_a_missing_folder_is_reported_without_network_access(
 ) -> None:
     assert main(["check", str(tmp_path / "none")]) == 3
     assert "no such folder" in capsys.readouterr().err
+
+
+def test_the_suggested_command_quotes_the_folder(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(sound, tmp_path / "two words"))
+    d.info(total_tasks=5)(root)
+    assert main(["check", str(root)]) == 3
+    (command,) = re.findall(r"`(egovcp-dataset repair .*?)`", capsys.readouterr().err)
+    assert shlex.split(command)[2] == str(root)
+
+
+@pytest.mark.parametrize("command", ["check", "repair", "info"])
+def test_a_revision_of_a_folder_is_refused(
+    command: str, sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = [f"--output_dir={tmp_path / 'new'}"] if command == "repair" else []
+    assert main([command, str(sound), "--dataset.revision=v1", *flags]) == 2
+    assert "--dataset.revision selects a version on the Hub" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from egovcp import packages
-from egovcp.data import ReturnConfig
+from egovcp.data import DatasetReader, ReturnConfig
 from egovcp.data.lerobot import LeRobotReader
+from egovcp.data.source import Source
 from egovcp.errors import DataError
 from egovcp_collect.dataset.cli import main
 from egovcp_collect.dataset.coverage import CoverageLimits, _feature_statistics, assess, summary
@@ -20,7 +21,9 @@ from egovcp_collect.dataset.statistics import (
     DatasetStatistics,
     compute_statistics,
 )
+from egovcp_collect.dataset.task_data import read_rows
 
+from . import damage as d
 from .scenes import scene, three_balls, write_scenes
 
 
@@ -54,7 +57,7 @@ def test_json_replaces_an_existing_file(root: Path, tmp_path: Path) -> None:
     assert main(["coverage", str(root), f"--json={path}"]) == 0
     found = json.loads(path.read_text())
     assert set(found["tasks"]) == {"ball", "arch"}
-    assert found["tasks"]["ball"]["events"]["block"]["ticks"] == 1
+    assert found["tasks"]["ball"]["term_rates"]["block"]["ticks"] == 1
     assert found["assessment"]["suitable"] is False
     assert {f["task"] for f in found["assessment"]["checks"]} == {"ball", "arch"}
     assert [p.name for p in tmp_path.iterdir()] == ["c.json"]
@@ -92,6 +95,19 @@ def test_a_missing_column_is_named(tmp_path: Path) -> None:
     pq.write_table(pq.read_table(path, partitioning=None).drop_columns(["action"]), path)
     with pytest.raises(DataError, match="column action is missing"):
         _feature_statistics(LeRobotReader(reader.root))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_value_that_is_not_finite_is_a_data_error(
+    value: float, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    d.column("next.reward", d.put(14, value))(copy)
+    with pytest.raises(DataError, match=f"episode 1, frame 2: next.reward is {value}, expected"):
+        read_rows(DatasetReader(Source(copy, "")), ReturnConfig())
+    plots = tmp_path / "plots"
+    assert main(["coverage", str(copy), f"--output_dir={plots}"]) == 3
+    assert f"{d.DATA}, episode 1, frame 2" in capsys.readouterr().err
+    assert not plots.exists()
 
 
 def test_no_dataset_is_a_data_error(tmp_path: Path) -> None:
@@ -133,15 +149,15 @@ def test_few_events_fail_by_default(found: DatasetStatistics) -> None:
 
 
 def test_rare_events_fail(found: DatasetStatistics) -> None:
-    (text,) = failed(found, event_episodes=200, steps=10**6)
+    (text,) = failed(found, event_episodes=200, frames=10**6)
     assert text.startswith("200 episodes with an event, 0.20 per 1000 ticks; expected at least ")
 
 
 @pytest.mark.parametrize(
     ("field", "counts"),
     [
-        ("good_episodes", "0 episodes with a success event, 1 with a failure event"),
-        ("bad_episodes", "1 episodes with a success event, 0 with a failure event"),
+        ("success_event_episodes", "0 episodes with a success event, 1 with a failure event"),
+        ("failure_event_episodes", "1 episodes with a success event, 0 with a failure event"),
     ],
 )
 def test_a_missing_kind_of_event_fails(found: DatasetStatistics, field: str, counts: str) -> None:
@@ -149,13 +165,13 @@ def test_a_missing_kind_of_event_fails(found: DatasetStatistics, field: str, cou
 
 
 def test_a_task_with_costs_only_needs_no_success_event(found: DatasetStatistics) -> None:
-    costs = {"good_episodes": 0, "has_success_events": False}
-    returns = replace(found.tasks[0].returns, positive_share=0.0, negative_share=0.1)
+    costs = {"success_event_episodes": 0, "has_success_events": False}
+    returns = replace(found.tasks[0].returns, success_event_share=0.0, failure_event_share=0.1)
     limits = replace(EASY, event_frames=0.01)
     assert failed(found, limits, **costs, returns=returns) == []
-    (text,) = failed(found, limits, **costs, returns=replace(returns, negative_share=0.0))
+    (text,) = failed(found, limits, **costs, returns=replace(returns, failure_event_share=0.0))
     assert text.endswith("expected at least 1% with a failure event")
-    (text,) = failed(found, limits, **costs, returns=returns, bad_episodes=0)
+    (text,) = failed(found, limits, **costs, returns=returns, failure_event_episodes=0)
     assert text.endswith("expected at least one with a failure event")
 
 
@@ -168,10 +184,10 @@ def test_a_single_outcome_fails(found: DatasetStatistics, share: float, advice: 
 
 def test_uninformative_returns_fail(found: DatasetStatistics) -> None:
     r = found.tasks[0].returns
-    assert r.spread is not None
-    (text,) = failed(found, returns=replace(r, spread=replace(r.spread, std=0.001)))
+    assert r.distribution is not None
+    (text,) = failed(found, returns=replace(r, distribution=replace(r.distribution, std=0.001)))
     assert "+- 0.001; expected a standard deviation of at least 0.02" in text
-    none = replace(r, valid_share=0.0, spread=None)
+    none = replace(r, valid_share=0.0, distribution=None)
     for limits in (EASY, replace(EASY, valid_frames=0.2)):
         (text,) = failed(found, limits, returns=none)
         assert text.startswith("0% of the frames have a return over ")
@@ -183,8 +199,9 @@ def test_narrow_actions_fail(found: DatasetStatistics) -> None:
     narrow = ActionStatistics.of(np.zeros((10, 7)))
     limits = replace(EASY, uniformity=0.85, occupied=0.5)
     uniformity, occupied = failed(found, limits, action=narrow)
-    assert uniformity.startswith("uniformity of the actions at least 0.0")
-    assert occupied == "0% of the cells of the left hand hold an action; expected at least 50%"
+    assert uniformity.startswith("lowest uniformity of an action: 0.0")
+    cells = "fewest occupied cells of the action box: 0% (left hand)"
+    assert occupied == f"{cells}; expected at least 50%"
 
 
 def test_missing_depth_fails(found: DatasetStatistics) -> None:
@@ -195,8 +212,8 @@ def test_missing_depth_fails(found: DatasetStatistics) -> None:
 
 
 def test_a_rare_task_fails(found: DatasetStatistics) -> None:
-    rest = replace(found.tasks[0], task="wall", step_share=0.9)
-    few = replace(found, tasks=(replace(found.tasks[0], step_share=0.1), rest))
+    rest = replace(found.tasks[0], task="wall", frame_share=0.9)
+    few = replace(found, tasks=(replace(found.tasks[0], frame_share=0.1), rest))
     texts = [(f.task, f.text) for f in assess(few, EASY) if not f.passed]
     text = "10% of the frames; expected at least 25%: collect more of this task"
     assert texts == [("ball", text)]

@@ -1,4 +1,4 @@
-"""Each kind of damage is refused: by the check, by training, and by name."""
+"""`egovcp-dataset check` and loading for training find each kind of damage and name the file."""
 
 import json
 from collections.abc import Iterable
@@ -30,9 +30,9 @@ class Case:
     episode: int | None = None
     frame: int | None = None
     training: bool = True
-    """Whoever trains must notice it as well."""
+    """Loading for training must raise, too."""
     by_hash: bool = False
-    """Only the recorded hashes can tell."""
+    """Found only by the recorded hashes."""
 
 
 _WIDE = pa.list_(pa.float64(), spec.STATE_DIM)

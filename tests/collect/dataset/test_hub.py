@@ -144,6 +144,14 @@ def test_a_link_is_not_followed(
     assert "events.png is a link" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["info", "coverage"])
+def test_a_revision_is_resolved_once(hub: FakeHub, root: Path, command: str) -> None:
+    assert push(root) == 0
+    hub.heal()
+    assert main([command, "me/six"]) == 0
+    assert hub.requests["info"] == 1
+
+
 def test_a_failed_pull_continues(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     assert push(root) == 0
     hub.heal()

@@ -5,14 +5,18 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from egovcp.data import schema
+from egovcp.data.stats import ROWS
 from egovcp_collect.dataset.cli import main
 from tests.support.lerobot_datasets import KINDS
 
 from . import damage as d
-from .test_others_damage import of_table, rows_of
+from .test_others_damage import item, of_table, rows_of
 
 
 def same_frames(root: Path, original: Path, episodes: list[int]) -> None:
@@ -65,6 +69,17 @@ def test_coverage_names_constant_values(
     rows_of(d.DATA, action=still)(root)
     assert main(["coverage", str(root)]) == 0
     assert "action[0] (pan) is always 1: it carries no information" in capsys.readouterr().out
+
+
+def test_coverage_refuses_a_value_that_is_not_finite(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, report = Path(shutil.copytree(others["arm"], tmp_path / "copy")), tmp_path / "report.json"
+    rows_of(d.DATA, observation_dot_state=item(9, [0.0, float("nan"), 0.0]))(root)
+    assert main(["coverage", str(root), f"--json={report}"]) == 3
+    message = f"{d.DATA}, episode 1, frame 1: observation.state[1] (lift) is nan"
+    assert message in capsys.readouterr().err
+    assert not report.exists()
 
 
 @pytest.mark.parametrize(
@@ -191,6 +206,103 @@ def test_repair_after_an_interrupted_recording(others: dict[str, Path], tmp_path
     assert main(["repair", str(root), f"--output_dir={output}"]) == 0
     assert main(["check", str(output)]) == 0
     same_frames(output, others["chunks"], [0, 1, 2, 3])
+
+
+@pytest.mark.parametrize("key", schema.INDEX_FEATURES)
+def test_a_missing_index_feature_is_named(
+    key: str, others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, output = Path(shutil.copytree(others["types"], tmp_path / "copy")), tmp_path / "new"
+    d.edit(d.INFO, lambda info: info["features"].pop(key))(root)
+    for command in (
+        ["check", str(root)],
+        ["repair", str(root), f"--output_dir={output}"],
+        ["delete", str(root), "--episodes=[0]", f"--output_dir={output}"],
+    ):
+        assert main(command) == 3
+        printed = capsys.readouterr()
+        assert f"{d.INFO}: feature {key} is missing" in printed.out + printed.err
+        assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (d.edit(d.INFO, lambda i: i["features"].pop("timestamp")), "feature timestamp is missing"),
+        (d.rows(lambda t: t.drop_columns(["timestamp"])), "episode 1: column timestamp is missing"),
+        (d.rows(lambda t: t.drop_columns(["action"])), "episode 1: column action is missing"),
+    ],
+)
+def test_viz_names_what_is_missing(
+    damage: d.Damage, message: str, others: dict[str, Path], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    root, output = Path(shutil.copytree(others["types"], tmp_path / "copy")), tmp_path / "a.rrd"
+    damage(root)
+    assert main(["viz", str(root), "--episode=1", f"--output={output}"]) == 3
+    assert message in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_lost_texts_of_tasks_are_named(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, output = Path(shutil.copytree(others["types"], tmp_path / "copy")), tmp_path / "new"
+    for name in (d.TASKS, "meta/episodes"):
+        d.remove(name)(root)
+    assert main(["repair", str(root), f"--output_dir={output}"]) == 3
+    assert f"{d.DATA}, episode 2: no text of its task is known" in capsys.readouterr().out
+    assert not output.exists()
+
+
+def test_rows_without_task_index_are_named(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    d.remove(d.TASKS)(root)
+    d.rows(lambda table: table.drop_columns(["task_index"]))(root)
+    assert main(["repair", str(root), f"--output_dir={tmp_path / 'new'}"]) == 3
+    assert "no text of its task is known" in capsys.readouterr().out
+
+
+def test_statistics_without_quantiles_are_kept(others: dict[str, Path], tmp_path: Path) -> None:
+    """As of a dataset converted from v2.1; those of an episode that is not listed are computed."""
+    root, output = Path(shutil.copytree(others["images"], tmp_path / "copy")), tmp_path / "new"
+
+    def drop(table: pa.Table) -> pa.Table:
+        quantiles = [n for n in table.column_names if n.rpartition("/")[2] in ROWS[4:]]
+        return table.drop_columns(quantiles).slice(1)
+
+    d.rows(drop, d.EPISODES)(root)
+    before = pq.read_table(root / d.EPISODES)
+    assert main(["repair", str(root), f"--output_dir={output}"]) == 0
+    assert main(["check", str(output)]) == 0
+    after = pq.read_table(output / d.EPISODES)
+    assert len(after) == len(before) + 1
+    mean = "stats/observation.image/mean"
+    assert after[mean].to_pylist()[1:] == before[mean].to_pylist()
+    assert "stats/observation.image/q01" not in after.column_names
+    assert "stats/observation.state/q01" in after.column_names
+    assert "q01" not in json.loads((output / d.STATS).read_text())["observation.image"]
+
+
+def test_an_episode_in_two_files_is_named(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, output = Path(shutil.copytree(others["types"], tmp_path / "copy")), tmp_path / "new"
+    table = pq.read_table(root / d.DATA)  # episode 1 has rows 30 to 69
+    pq.write_table(table.slice(0, 50), root / d.DATA)
+    pq.write_table(table.slice(50), root / d.MORE_DATA)
+    assert main(["delete", str(root), "--episodes=[0]", f"--output_dir={output}"]) == 3
+    length = f"{d.DATA}, episode 1: meta/episodes gives it 40 frames, but it has 20"
+    assert length in capsys.readouterr().err
+    assert not output.exists()
+    assert main(["repair", str(root), f"--output_dir={output}"]) == 0
+    out = capsys.readouterr().out
+    assert f"kept: {root / length}" in out
+    assert f"{d.MORE_DATA}, episode 1: it has rows in another place" in out
+    capsys.readouterr()
+    assert main(["delete", str(root), "--episodes=[1]", f"--output_dir={tmp_path / 'less'}"]) == 0
 
 
 def test_nothing_sound_leaves_no_dataset(others: dict[str, Path], tmp_path: Path) -> None:

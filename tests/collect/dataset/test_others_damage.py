@@ -156,6 +156,20 @@ def test_damage_is_named(
     assert text in capsys.readouterr().out
 
 
+def test_what_is_not_checked_is_unknown_after_the_last_problem(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(others["arm"], tmp_path / "copy"))
+    d.info(total_frames=99)(root)
+    report = tmp_path / "report.json"
+    assert main(["check", str(root), f"--json={report}", "--max_problems=1"]) == 3
+    assert json.loads(report.read_text())["not_checked"] is None
+    assert "stopped after 1 problems; the rest was not checked" in capsys.readouterr().out
+    assert main(["check", str(root), f"--json={report}"]) == 3
+    assert json.loads(report.read_text())["not_checked"]
+    assert "stopped" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("statistics", [True, False])
 def test_an_episode_is_read_beside_a_damaged_one(
     statistics: bool, others: dict[str, Path], tmp_path: Path

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +12,13 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
+from egovcp.testing import random_episode
 from egovcp_collect.dataset.cli import main
 
 from . import damage as d
 from .conftest import COLLECTED, walk, write
 from .damage import COLLECTION, DATA, EPISODES, INFO, MORE_DATA, STATS, TASKS
+from .scenes import ARM
 
 pytestmark = pytest.mark.usefixtures("no_network")
 
@@ -61,7 +64,19 @@ def test_merge_refuses_or_drops_duplicates(
     report = tmp_path / "report.json"
     assert main([*flags, "--duplicates=drop", f"--json={report}"]) == 0
     assert _digests(new) == [*_digests(sound), _digests(again)[0]]
-    assert json.loads(report.read_text())["dropped"] == 1
+    assert json.loads(report.read_text())["duplicates_dropped"] == 1
+
+
+def test_the_recorded_command_repeats_the_merge(sound: Path, tmp_path: Path) -> None:
+    other = write(tmp_path / "other", [6, 4], Provenance("stance-1", 6, config={"eta": 0.1}))
+    new = tmp_path / "new"
+    flags = [f"--output_dir={new}", "--duplicates=drop"]
+    assert main(["merge", str(sound), str(other), *flags]) == 0
+    command = _reader(new).provenance["command"]
+    assert command == f"egovcp-dataset merge {sound} {other} --duplicates=drop"
+    again = tmp_path / "again"
+    assert main([*shlex.split(command)[1:], f"--output_dir={again}"]) == 0
+    assert _digests(again) == _digests(new)
 
 
 @pytest.mark.parametrize("duplicates", ["refuse", "drop"])
@@ -206,6 +221,32 @@ def test_repair_without_records_needs_the_originals(
     assert "--records=ORIGINAL" in capsys.readouterr().err
     assert main(["repair", str(copy), f"--output_dir={new}", f"--records={sound}"]) == 0
     assert _digests(new) == _digests(sound)
+
+
+@pytest.mark.parametrize("form", ["{a},{b}", "[{a}, {b}]"])
+def test_records_are_taken_from_several_datasets(
+    form: str, sound: Path, copy: Path, tmp_path: Path
+) -> None:
+    (copy / COLLECTION).unlink()
+    other = write(tmp_path / "other", [6], Provenance("stance-1", 6, config={"eta": 0.1}))
+    new = tmp_path / "new"
+    records = f"--records={form.format(a=other, b=sound)}"
+    assert main(["repair", str(copy), records, f"--output_dir={new}"]) == 0
+    assert _digests(new) == _digests(sound)
+    flags = shlex.split(_reader(new).provenance["command"])[3:]
+    assert main(["repair", str(copy), *flags, f"--output_dir={tmp_path / 'again'}"]) == 0
+
+
+def test_repair_says_that_the_robot_is_unknown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, new = tmp_path / "arm", tmp_path / "new"
+    with DatasetWriter(root, Provenance("arm-1")) as writer:
+        writer.add(random_episode(0, robot=ARM))
+    assert main(["repair", str(root), f"--output_dir={new}"]) == 0
+    d.cut(INFO, 0.5)(root)
+    assert main(["repair", str(root), f"--output_dir={tmp_path / 'other'}"]) == 3
+    assert "meta/info.json is damaged, so the robot is unknown" in capsys.readouterr().err
 
 
 def test_the_reader_suggests_repair(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -40,8 +40,8 @@ def found(reader: DatasetReader) -> DatasetStatistics:
 
 def test_tasks_share_the_steps(found: DatasetStatistics, reader: DatasetReader) -> None:
     assert [task.task for task in found.tasks] == ["ball", "arch"]
-    assert sum(task.steps for task in found.tasks) == reader.num_frames
-    assert sum(task.step_share for task in found.tasks) == pytest.approx(1.0)
+    assert sum(task.frames for task in found.tasks) == reader.num_frames
+    assert sum(task.frame_share for task in found.tasks) == pytest.approx(1.0)
 
 
 def test_returns_equal_those_of_the_training_store(reader: DatasetReader) -> None:
@@ -79,12 +79,13 @@ def test_events_ahead_come_from_recorded_terms_not_from_action_costs(tmp_path: P
 def test_events_are_counted_per_tick_and_per_episode(found: DatasetStatistics) -> None:
     ball = found.tasks[0]
     steps = 2 * LENGTH + 41
-    block, hands = ball.events["block"], ball.events["touch.hands"]
+    block, hands = ball.term_rates["block"], ball.term_rates["touch.hands"]
     assert (block.ticks, block.episodes) == (1, 1)
     assert block.per_1000_ticks == pytest.approx(1000 / steps)
     assert block.episode_share == pytest.approx(1 / 3)
     assert (hands.ticks, hands.episodes) == (3, 1)
-    assert (ball.event_episodes, ball.good_episodes, ball.bad_episodes) == (2, 1, 1)
+    episodes = (ball.event_episodes, ball.success_event_episodes, ball.failure_event_episodes)
+    assert episodes == (2, 1, 1)
 
 
 def test_event_episodes_are_counted_by_column_not_by_the_name_of_the_term(tmp_path: Path) -> None:
@@ -97,9 +98,22 @@ def test_event_episodes_are_counted_by_column_not_by_the_name_of_the_term(tmp_pa
         for i, t in enumerate(terms)
     ]
     (bag,) = compute_statistics(write_scenes(tmp_path / "bag", episodes), RETURNS).tasks
-    assert (bag.event_episodes, bag.good_episodes, bag.bad_episodes) == (1, 1, 0)
+    assert (bag.event_episodes, bag.success_event_episodes, bag.failure_event_episodes) == (1, 1, 0)
     assert bag.has_success_events
-    assert _event_colour("stop", bag.events["stop"]) == _SUCCESS
+    assert _event_colour("stop", bag.term_rates["stop"]) == _SUCCESS
+
+
+def test_events_of_an_episode_without_terms_are_changes_of_the_reward(tmp_path: Path) -> None:
+    terms = np.zeros((2, LENGTH, len(REWARD_TERMS)), np.float32)
+    terms[0, 20, REWARD_TERMS.index("block")] = 1.0
+    terms[1, 30, REWARD_TERMS.index("hit")] = -1.0
+    recorded, older = (replace(scene(i), reward=t.sum(axis=1)) for i, t in enumerate(terms))
+    episodes = [replace(recorded, reward_terms=terms[0]), older]
+    found = compute_statistics(write_scenes(tmp_path / "mixed", episodes), RETURNS)
+    (task,), (rows,) = found.tasks, found.rows
+    assert (task.success_event_episodes, task.failure_event_episodes) == (1, 1)
+    success, failure = (np.flatnonzero(event) for event in events_ahead(rows, 1))
+    assert (success.tolist(), failure.tolist()) == ([20], [LENGTH + 30])
 
 
 @pytest.mark.parametrize(("task", "expected"), [("wall", False), ("ball", True)])
@@ -166,9 +180,9 @@ def test_a_sample_has_twelve_episodes_and_shows_frames_from_the_event_on(
 def test_episodes_without_metadata_and_returns_have_empty_statistics(sound: Path) -> None:
     found = compute_statistics(DatasetReader.open(DatasetConfig(root=str(sound))), ReturnConfig())
     for task in found.tasks:
-        assert task.returns.spread is None
+        assert task.returns.distribution is None
         assert task.returns.valid_share == 0.0
-        assert task.events == {}
+        assert task.term_rates == {}
 
 
 def actions(n: int = 100_000) -> np.ndarray:

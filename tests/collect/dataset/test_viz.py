@@ -8,15 +8,20 @@ import pytest
 from rerun.experimental import RrdReader
 
 from egovcp import packages, spec
-from egovcp.data import DatasetReader
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
+from egovcp.data.source import lerobot_home
+from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.log import paths
 from egovcp.robot.kinematics import LINK_NAMES
-from egovcp.rollouts import camera_view, ticks_of
+from egovcp.rollouts import camera_view, run_info, ticks_of
+from egovcp.testing import random_episode
 from egovcp_collect.dataset import viz
 from egovcp_collect.dataset.cli import main
 from egovcp_collect.dataset.viz import write_recording
+from tests.support.hub import FakeHub
 
-from .scenes import SETTINGS, scene, three_balls, write_scenes
+from .conftest import write
+from .scenes import ARM, SETTINGS, scene, three_balls, write_scenes
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +115,51 @@ def test_the_command_names_the_file_after_dataset_and_episode(
     assert [p.name for p in tmp_path.iterdir()] == ["three-episode-2.rrd"]
     assert main(["viz", str(reader.root), "--episode=2"]) == 5
     assert "exists already" in capsys.readouterr().err
+
+
+def test_no_pose_is_mentioned_of_another_robot(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "arm"
+    with DatasetWriter(root, Provenance("arm-1")) as writer:
+        writer.add(random_episode(0, robot=ARM))
+    assert main(["viz", str(root), f"--output={tmp_path / 'arm.rrd'}"]) == 0
+    assert "pelvis" not in capsys.readouterr().out
+    reader = DatasetReader.open(DatasetConfig(root=str(root)))
+    assert "pose" not in run_info(reader, 0, reader.read(0)).config
+
+
+def test_mcap_of_a_dataset_of_another_origin_is_refused(
+    others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "arm.mcap"
+    assert main(["viz", str(others["arm"]), f"--output={output}"]) == 2
+    assert "MCAP needs a dataset that egovcp collected" in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_of_a_dataset_on_the_hub_only_the_file_of_the_episode_is_downloaded(
+    hub: FakeHub, tmp_path: Path
+) -> None:
+    root = write(tmp_path / "six", [*range(6)])
+    assert main(["push", str(root), "--repo_id=me/six"]) == 0
+    output = tmp_path / "me.rrd"
+    assert main(["viz", "me/six", "--episode=4", f"--output={output}"]) == 0
+    assert output.is_file()
+    assert [p.name for p in lerobot_home().rglob("file-*") if "data" in p.parts] == [
+        "file-001.parquet"
+    ]
+
+
+def test_a_dataset_of_another_origin_on_the_hub_is_shown(
+    hub: FakeHub, others: dict[str, Path], tmp_path: Path
+) -> None:
+    files = [path for path in others["arm"].rglob("*") if path.is_file()]
+    contents = {path.relative_to(others["arm"]).as_posix(): Content(path) for path in files}
+    publish(Publication("me/arm", contents, "an arm"), RetryPolicy(attempts=2))
+    output = tmp_path / "arm.rrd"
+    assert main(["viz", "me/arm", f"--output={output}"]) == 0
+    assert output.is_file()
 
 
 @pytest.mark.parametrize("episode", [-1, 3])

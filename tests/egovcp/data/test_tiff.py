@@ -1,3 +1,5 @@
+"""Depth images as TIFF: identical to Pillow's, and refused if damaged."""
+
 import io
 
 import numpy as np
