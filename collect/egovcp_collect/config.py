@@ -11,7 +11,7 @@ from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
 from egovcp.sim.config import EnvConfig, require_memory_for_robots, short_episodes
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.scenario import HELD_OUT, Scenario
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT
 
@@ -76,13 +76,18 @@ class CollectConfig:
         check_cores(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
+        if self.seed >= HELD_OUT:
+            raise UsageError(
+                f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
+                "beyond are for evaluation"
+            )
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes)
         require_memory_for_robots("--num_envs", self.num_envs, robots)
         tasks = select_tasks(self.task, training=True)
         if unknown := sorted(set(self.mix) - set(tasks)):
             raise UsageError(
-                f"--mix.{unknown[0]}: --task={self.task} does not have this task, but "
+                f"--mix.{unknown[0]}: not a task of --task={self.task}; expected one of "
                 f"{', '.join(tasks)}"
             )
         shortest, longest = self.step_ticks

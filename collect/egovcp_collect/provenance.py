@@ -83,7 +83,7 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
         omitted = len(changed) - _SHOWN_DIFFERENCES
         more = f", and {omitted} more" if omitted > 0 else ""
         raise UsageError(
-            "--resume would add episodes of other settings: "
-            f"{'; '.join(changed[:_SHOWN_DIFFERENCES])}{more}; use the settings of the dataset, or "
-            "another --dataset.root"
+            "--resume would add episodes that were made differently: "
+            f"{'; '.join(changed[:_SHOWN_DIFFERENCES])}{more}; use the settings and package "
+            "versions of the dataset, or another --dataset.root"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import time
 import traceback
 from collections import Counter, deque
@@ -30,7 +31,7 @@ from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
 MAX_ATTEMPTS: Final = 3
-"""How many workers may die on the same episode before the collection stops."""
+"""Number of lost workers with the same unfinished episode at which the collection stops."""
 _POLL_S: Final = 0.25
 _REPORT_S: Final = 0.25
 _MAX_PENDING: Final = 32  # episodes in memory that wait for the disk
@@ -40,6 +41,9 @@ class WorkerPool:
     """Assigns episodes to workers, and replaces workers that are lost.
 
     Args:
+        start: creates a worker.
+        workers: number of processes; fewer if there are few episodes.
+        scenarios: episodes to play, in order.
         num_envs: episodes that each worker simulates in parallel.
         timeout: seconds without a report after which a worker is replaced.
     """
@@ -96,7 +100,7 @@ class WorkerPool:
             if report.error is not None:
                 raise report.error
         if not alive:
-            self._replace(worker, "was killed (out of memory? try fewer --num_workers)")
+            self._replace(worker, worker.death)
         elif worker.unfinished and time.monotonic() - worker.last_report > self._timeout:
             self._replace(worker, f"sent no report for {self._timeout:.0f} s")
         return reports
@@ -113,8 +117,8 @@ class WorkerPool:
         if attempts >= MAX_ATTEMPTS:
             first, last = min(worker.unfinished), max(worker.unfinished)
             raise EnvironmentFailure(
-                f"a worker {reason}, {attempts} times in a row, while it simulated episodes "
-                f"{first} to {last}"
+                f"{attempts} workers were lost with the same unfinished episodes ({first} to "
+                f"{last}); the last one {reason}"
             )
         self._waiting.extendleft(reversed(worker.unfinished.values()))
 
@@ -126,7 +130,10 @@ class WorkerPool:
         self._assign(worker, min(2 * self._num_envs, share))
 
     def _refill(self, worker: Worker) -> None:
-        """Assign enough episodes to keep all robots of a worker busy, less towards the end."""
+        """Keep up to two episodes per robot of a worker assigned; the last ones are shared equally.
+
+        Waits until a quarter of the robots has none, so that messages are few.
+        """
         share = -(-(len(self._waiting) + len(worker.unfinished)) // self._count)
         wanted = min(2 * self._num_envs, max(self._num_envs, share)) - len(worker.unfinished)
         count = min(wanted, len(self._waiting))
@@ -154,7 +161,7 @@ class WorkerReport:
     """The error that ended the worker; this is its last report."""
 
 
-def picklable(error: Exception) -> Exception:
+def as_picklable(error: Exception) -> Exception:
     """The error, or a `RuntimeError` with its message if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))  # noqa: S301 - bytes made in this expression
@@ -177,7 +184,7 @@ class Worker:
         remote.close()
         self.last_report = time.monotonic()
         self.unfinished: dict[int, Scenario] = {}
-        """Its episodes by number."""
+        """Assigned episodes that it has not reported as finished, by number."""
 
     @property
     def waitables(self) -> list[Connection | int]:
@@ -192,7 +199,7 @@ class Worker:
             self.process.join(timeout=1)
 
     def poll(self) -> list[WorkerReport]:
-        """Reports since the last call; does not block."""
+        """Reports since the last call; waits at most 1 s if the process is ending."""
         reports: list[WorkerReport] = []
         try:
             while self.pipe.poll():
@@ -205,6 +212,14 @@ class Worker:
     def alive(self) -> bool:
         """Whether more reports can follow."""
         return self.process.is_alive()
+
+    @property
+    def death(self) -> str:
+        """How the process ended."""
+        self.process.join(timeout=1)
+        code = self.process.exitcode
+        hint = " (out of memory? try fewer --num_workers)" if code == -signal.SIGKILL else ""
+        return f"ended with exit code {code}{hint}"
 
     def kill(self) -> None:
         """End it immediately; returns when it has ended."""
@@ -232,7 +247,7 @@ def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: 
         return
     except Exception as error:  # noqa: BLE001 - every error is reported to the collection
         error.add_note(traceback.format_exc())
-        pipe.send(WorkerReport(0, error=picklable(error)))
+        pipe.send(WorkerReport(0, error=as_picklable(error)))
 
 
 def _stage(staging: StagingDir, number: int, episode: Episode) -> int:

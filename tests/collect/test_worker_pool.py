@@ -44,6 +44,10 @@ class _Worker:
             return []
         return [WorkerReport(10, (self._todo.pop(0),))]
 
+    @property
+    def death(self) -> str:
+        return "ended"
+
     def kill(self) -> None:
         self.alive, self.killed = False, True
 
@@ -116,7 +120,7 @@ def test_an_episode_that_kills_every_worker_raises() -> None:
         worker.alive = number != 7
 
     with pytest.raises(
-        EnvironmentFailure, match=rf"was killed .*{MAX_ATTEMPTS} times.* episodes 7 to"
+        EnvironmentFailure, match=rf"{MAX_ATTEMPTS} workers were lost .*episodes \(7 to .* ended"
     ):
         _run(behaviour)
 
