@@ -1,5 +1,4 @@
-"""Controllers that are compared with the planner: references that need no learning, and the search
-for the best constant action."""
+"""Reference controllers, and the search for the best constant action."""
 
 from __future__ import annotations
 
@@ -16,8 +15,7 @@ from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError, read_json
 from egovcp.plan import PolicyStep
 from egovcp.sim.base_env import BaseVectorEnv
-from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
-from egovcp.sim.policies import EnvPolicy as SimPolicy
+from egovcp.sim.policies import Constant, EnvPolicy, Hold, Oracle, RandomWalk
 from egovcp.sim.scenario import SEARCH, Scenario
 from egovcp.sim.tasks.registry import find_task, task_names
 from egovcp.spec import ACTION_DIM
@@ -32,26 +30,26 @@ type PlayConstants = Callable[[Sequence[Action], Sequence[Scenario]], list[list[
 
 CONSTANT: Final = "constant"
 PPO: Final = "ppo"
-CONTROLLERS: Final = (PLANNER, "hold", CONSTANT, "random", "oracle")
+DEFAULT_CONTROLLERS: Final = (PLANNER, "hold", CONSTANT, "random", "oracle")
 
 _REDUCTION: Final = 4  # a quarter of the candidates advances to the next round
 _FIRST_ROUND: Final = 6  # scenarios that every candidate plays
 
 
-def reference(name: str, action: Action = ()) -> SimPolicy:
+def reference(name: str, action: Action = ()) -> EnvPolicy:
     """``hold``, ``random``, ``oracle``, or ``constant`` with its ``action``."""
     if name == CONSTANT:
         return Constant(action)
-    policies: dict[str, type[SimPolicy]] = {"hold": Hold, "random": RandomWalk, "oracle": Oracle}
+    policies: dict[str, type[EnvPolicy]] = {"hold": Hold, "random": RandomWalk, "oracle": Oracle}
     return policies[name]()
 
 
 class ReferencePolicy:
-    """A policy of the simulator, which sees the environment instead of the observations;
+    """Adapts an `EnvPolicy` to `RolloutPolicy`: it acts on the environment, not on observations;
     ``scenarios()`` are those of the present episodes."""
 
     def __init__(
-        self, policy: SimPolicy, env: BaseVectorEnv, scenarios: Callable[[], Sequence[Scenario]]
+        self, policy: EnvPolicy, env: BaseVectorEnv, scenarios: Callable[[], Sequence[Scenario]]
     ) -> None:
         self._policy, self._env, self._scenarios = policy, env, scenarios
 
@@ -109,14 +107,13 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
         candidates.sort(key=lambda action: -eval_scores(scores[action]).reward_per_step)
         candidates, count = candidates[: max(1, len(candidates) // _REDUCTION)], count * 2
     best = eval_scores(scores[candidates[0]])
-    rate, count = best.success_rate, best.success.size
-    return BestConstant(candidates[0], best.reward_per_step, rate, count)
+    return BestConstant(candidates[0], best.reward_per_step, best.success_rate, best.success.size)
 
 
 def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestConstant]:
     """Task -> result, from the ``constant.json`` of an earlier evaluation in the same ``setting``
-    (controller and environment); without any, a note is printed. Raises `DataError` if it is
-    missing or of another format, `UsageError` if the settings differ."""
+    (controller and environment); if the file records none, a warning is printed. Raises
+    `DataError` if it is missing or of another format, `UsageError` if the settings differ."""
     try:
         content = read_json(path)
         constants = {task: _parse(task, entry) for task, entry in content["constants"].items()}
@@ -129,7 +126,11 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
             f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"
         ) from error
     if not known:
-        echo(f"--constant.path={path} names no controller and environment: used unchecked")
+        echo(
+            f"warning: --constant.path={path} records no controller and environment; they are not "
+            "checked",
+            error=True,
+        )
     for name, (old, new) in differences(known, setting):
         if old is not None:  # None: unknown, as an option of a later version
             raise UsageError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -82,7 +83,8 @@ class EpisodePlayer:
         if key not in self._policies:
             learned: RolloutPolicy
             if group.controller == PPO:
-                learned = ReactivePolicy(ReactiveNetwork.load(Path(config.ppo.path)), robots)
+                network = ReactiveNetwork.load(Path(os.path.expanduser(config.ppo.path)))
+                learned = ReactivePolicy(network, robots)
             else:
                 self._artifact = self._artifact or load_policy(config.policy, config.planner)
                 learned = self._artifact.make_policy(robots, config.seed)
@@ -101,8 +103,8 @@ def play(
 ) -> list[EpisodeScore]:
     """Play one episode on each instance of ``env``; returns the scores of the episodes that ended.
 
-    Unless ``stopped()`` becomes true, these are all, and the first ones are drawn as ``videos``,
-    whose paths have no suffix.
+    If ``stopped()`` becomes true, these are not all, and no video is written. ``videos`` are the
+    paths, without suffix, for the first instances.
     """
     observation = env.reset(scenarios)
     policy.reset()
@@ -172,7 +174,7 @@ def _draw(
                 depth=observation.depth[i].copy(),
                 state=observation.state[i].copy(),
                 action_planned=step.action[i],
-                action_sent=step.action[i],
+                action_sent=step.action[i],  # before the safety filter; `PictureSink` ignores it
                 base=base,
                 scene=scene,
                 depth_imagined=None if imagined is None else imagined[i],
@@ -181,9 +183,11 @@ def _draw(
 
 
 class EpisodePool:
-    """Plays groups in worker processes that last until `close`; with a single worker, in this
-    process and with ``artifact``, else each one loads the policy. Once ``stopped()`` is true,
-    episodes in progress are abandoned."""
+    """Plays groups in worker processes, each of which loads the policy; they last until `close`.
+
+    With one worker it plays in this process, with ``artifact``. After ``stopped()`` turns true,
+    unfinished episodes are abandoned.
+    """
 
     def __init__(
         self,

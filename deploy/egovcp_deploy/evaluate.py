@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
@@ -29,7 +30,7 @@ from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_deploy.controllers import (
     CONSTANT,
-    CONTROLLERS,
+    DEFAULT_CONTROLLERS,
     PPO,
     Action,
     BestConstant,
@@ -42,9 +43,9 @@ from egovcp_deploy.options import (
     SEEDS,
     check_output_dir,
     encoded,
+    evaluation_versions,
     held_out,
     make_output_dir,
-    versions,
 )
 from egovcp_deploy.pilot.planner import backend_of
 from egovcp_deploy.scores import EpisodeScore, summary, table
@@ -95,7 +96,7 @@ class EvalConfig:
     """Scenarios per task."""
     seed: int = bounded(0, least=0, below=SEEDS)
     """Seed of the held-out scenarios."""
-    controllers: str = ",".join(CONTROLLERS)
+    controllers: str = ",".join(DEFAULT_CONTROLLERS)
     """Separated by commas: planner, hold (neutral pose), constant (best fixed action), random (the
     paper's walk), oracle (scripted, uses the simulator's state), ppo (model-free PPO)."""
     constant: ConstantOptions = field(default_factory=ConstantOptions)
@@ -131,7 +132,7 @@ class EvalConfig:
             if "oracle" in self.controller_names and not find_task(task).has_oracle():
                 raise UsageError(f"task {task} has no oracle; leave it out of --controllers")
         for name in self.controller_names:
-            if name not in (known := (*CONTROLLERS, PPO)):
+            if name not in (known := (*DEFAULT_CONTROLLERS, PPO)):
                 raise UsageError(f"unknown value --controllers={name}{suggest(name, known)}")
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
@@ -164,7 +165,7 @@ def evaluate(config: EvalConfig) -> None:
     env = encoded(config.env) | {"controller": None}  # its identity is compared instead of its path
     setting = {"low_level_controller": controller_id, "env": env}
     path = config.constant.path
-    constants = load_constants(Path(path), setting) if path else {}
+    constants = load_constants(Path(os.path.expanduser(path)), setting) if path else {}
     artifact, ppo, backend = None, None, ""
     if PLANNER in config.controller_names:
         artifact = load_policy(config.policy, config.planner)
@@ -173,7 +174,7 @@ def evaluate(config: EvalConfig) -> None:
         policy.prepare()  # compile once, before workers need it
         backend = backend_of(policy)
     if PPO in config.controller_names:
-        ppo = ReactiveNetwork.load(Path(config.ppo.path))
+        ppo = ReactiveNetwork.load(Path(os.path.expanduser(config.ppo.path)))
         ppo.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
     scores: Scores = {task: {name: [] for name in config.controller_names} for task in config.tasks}
@@ -198,7 +199,7 @@ def evaluate(config: EvalConfig) -> None:
                 "artifact": artifact.manifest if artifact else None,
                 "ppo": dict(ppo.provenance) if ppo else None,
                 "low_level_controller": controller_id,
-                "versions": versions(),
+                "versions": evaluation_versions(),
                 "constants": {task: asdict(best) for task, best in constants.items()},
                 "episodes": {
                     task: {

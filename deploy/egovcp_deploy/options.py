@@ -74,6 +74,6 @@ def encoded(config: object, *paths: str) -> dict[str, Any]:
     return options
 
 
-def versions() -> dict[str, str]:
+def evaluation_versions() -> dict[str, str]:
     """Distribution -> version, of the packages that determine the results."""
     return versions_of(_PACKAGES)

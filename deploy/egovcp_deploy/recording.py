@@ -18,7 +18,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.tick import Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
 from egovcp.terminal import echo
-from egovcp_deploy.options import versions, video_paths
+from egovcp_deploy.options import evaluation_versions, video_paths
 
 if TYPE_CHECKING:
     from egovcp.log.viewer import Viewer
@@ -109,7 +109,7 @@ def run_info(
         seed=config.seed,
         config=config.encoded(),
         hashes={_CONTROLLER: controller_id, **files},
-        versions=versions(),
+        versions=evaluation_versions(),
         backend=backend,
     )
 

@@ -105,7 +105,7 @@ def serve(commands: Connection, reports: Connection) -> None:
         sink.close()
         _report(reports, None)
     except Exception as error:  # noqa: BLE001 - every error is reported to the parent
-        _report(reports, _picklable(error))
+        _report(reports, _as_picklable(error))
         with suppress(Exception):
             if sink is not None:
                 sink.close()
@@ -117,7 +117,7 @@ def _report(reports: Connection, report: WriterReport) -> None:
         reports.send(report)
 
 
-def _picklable(error: Exception) -> Exception:
+def _as_picklable(error: Exception) -> Exception:
     """The error itself if it is an `EgovcpError` or `OSError` and can be pickled, else its text."""
     if isinstance(error, EgovcpError | OSError):
         with suppress(Exception):

@@ -14,7 +14,7 @@ from egovcp_deploy.evaluate import main as evaluate
 
 
 def write(folder: Path, rewards: list[float], task: str = "ball", **options: Any) -> str:
-    """What egovcp-eval would leave there, had each episode ended with such a reward."""
+    """Write an `eval_run.json` whose episodes have these rewards; returns the folder."""
     played = [
         {"episode": i, "steps": 10, "reward": r, "success": r > 0, "terminated": False}
         for i, r in enumerate(rewards)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.pilot.pilot import HOLD_RATE, PATIENCE_TICKS, PlanBuffer, SafetyFilter
+from egovcp_deploy.pilot.pilot import HOLD_RATE, MAX_REPEATS, PlanBuffer, SafetyFilter
 
 SPECIALS = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, 1.0, -1.0, 1.5])
 
 
 def test_fuzzed_actions_never_leave_the_envelope() -> None:
     rng = np.random.default_rng(0)
-    safety, last = SafetyFilter(rows=100), np.zeros((100, ACTION_DIM))
+    safety, last = SafetyFilter(num_envs=100), np.zeros((100, ACTION_DIM))
     for _ in range(1000):  # 100 000 actions
         planned = rng.normal(0, 2, last.shape)
         odd = rng.random(last.shape) < 0.1
@@ -52,7 +52,7 @@ def test_without_a_planner_the_hands_ease_to_neutral() -> None:
     for _ in range(4):
         last = safety.filter(np.ones((1, ACTION_DIM)))
     nothing = np.full((1, ACTION_DIM), np.nan)
-    for _ in range(PATIENCE_TICKS):
+    for _ in range(MAX_REPEATS):
         np.testing.assert_array_equal(safety.filter(nothing), last)
     assert not safety.holding[0]
     for _ in range(40):
@@ -64,9 +64,9 @@ def test_without_a_planner_the_hands_ease_to_neutral() -> None:
 
 
 def test_one_good_action_ends_the_hold_and_rows_are_independent() -> None:
-    safety = SafetyFilter(rows=2)
+    safety = SafetyFilter(num_envs=2)
     mixed = np.stack([np.full(ACTION_DIM, np.nan), np.full(ACTION_DIM, 0.1)])
-    for _ in range(PATIENCE_TICKS + 2):
+    for _ in range(MAX_REPEATS + 2):
         safety.filter(mixed)
     assert safety.holding.tolist() == [True, False]
     safety.filter(np.zeros((2, ACTION_DIM)))

@@ -29,10 +29,11 @@ from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State, Su
 
 Array = NDArray[np.float64]
 
-PATIENCE_TICKS: Final = 5  # consecutive rejected actions before the hands ease to neutral
-HOLD_RATE: Final = 0.04  # box units per tick towards neutral: 1 unit in 1 s
+MAX_REPEATS: Final = 5  # rejected actions for which the last one is repeated, before easing
+HOLD_RATE: Final = 0.04  # normalised units per tick towards neutral: 1 unit in 1 s
 REJECTED: Final = "plan rejected: not finite"
-UNREQUESTED: Final = "plan rejected: for a tick without an observation"
+OUTDATED: Final = "plan ignored: not newer than the last one"
+UNREQUESTED: Final = "plan rejected: for a future tick"
 
 
 class PlanBuffer:
@@ -45,7 +46,7 @@ class PlanBuffer:
         self.misses = 0  # consecutive ticks without a plan in time
 
     def offer(self, tick: int, plan: NDArray[np.floating]) -> bool:
-        """Take the plan (N, 7) made for ``tick``; false if it is not finite or not newer."""
+        """Take the plan (N, A) made for ``tick``; false if it is not finite or not newer."""
         actions = np.asarray(plan, np.float64)
         if tick <= self._tick or not np.isfinite(actions).all():
             return False
@@ -57,7 +58,7 @@ class PlanBuffer:
         return self._tick == tick
 
     def action(self, tick: int) -> Array | None:
-        """The action (7,) for ``tick``; call it once per tick. None: no plan covers the tick."""
+        """The action (A,) for ``tick``; call it once per tick. None: no plan covers the tick."""
         self.misses = 0 if self.has(tick) else self.misses + 1
         if self._plan is None:
             return None
@@ -70,15 +71,15 @@ class SafetyFilter:
 
     The limits are those of the data collection, so that the robot stays within the training data.
     An action that is not finite is rejected, before it is clamped: the robot repeats its last
-    action, and after `PATIENCE_TICKS` rejections in a row it eases to the neutral pose.
+    action, and after `MAX_REPEATS` rejections in a row it eases to the neutral pose.
     """
 
-    def __init__(self, rows: int = 1, actions: int = ACTION_DIM) -> None:
-        self._last: Array = np.zeros((rows, actions))
-        self._rejections: NDArray[np.int64] = np.zeros(rows, np.int64)
+    def __init__(self, num_envs: int = 1, action_dim: int = ACTION_DIM) -> None:
+        self._last: Array = np.zeros((num_envs, action_dim))
+        self._rejections: NDArray[np.int64] = np.zeros(num_envs, np.int64)
 
     def filter(self, planned: NDArray[np.floating]) -> Array:
-        """Planned actions (E, 7) of any value -> actions that may be sent: in [-1, 1], at most the
+        """Planned actions (E, A) of any value -> actions that may be sent: in [-1, 1], at most the
         rate limit away from the last."""
         wanted = np.array(planned, np.float64)
         rejected = np.any(~np.isfinite(wanted), axis=1)
@@ -90,18 +91,19 @@ class SafetyFilter:
         return self._last.copy()
 
     def ease(self) -> Array:
-        """(E, 7) the next action towards the neutral pose."""
+        """(E, A) the next action towards the neutral pose."""
         self._last = self._eased()
         return self._last.copy()
 
     def repeat(self) -> Array:
-        """(E, 7) the last action once more."""
+        """(E, A) the last action once more."""
         return self._last.copy()
 
     @property
     def holding(self) -> NDArray[np.bool_]:
-        """(E,) robots that have lost their planner and ease to neutral."""
-        holding: NDArray[np.bool_] = self._rejections > PATIENCE_TICKS
+        """(E,) whether more than `MAX_REPEATS` actions in a row were rejected, so that the robot
+        eases to the neutral pose."""
+        holding: NDArray[np.bool_] = self._rejections > MAX_REPEATS
         return holding
 
     def _eased(self) -> Array:
@@ -114,8 +116,8 @@ class Freshness:
 
     A driver that has died behind a live connection repeats its last reading with new time stamps.
     Real sensors are noisy: a reading that repeats bit for bit is not new. Depth images without a
-    valid pixel are the exception: with nothing in range all of them are equal. So are simulated
-    sensors without noise, if ``repeats``.
+    valid pixel are the exception: with nothing in range all of them are equal. With ``repeats``,
+    for simulated sensors without noise, every reading counts as new.
     """
 
     def __init__(self, repeats: bool = False) -> None:
@@ -169,13 +171,13 @@ class Pilot:
         self._planner = planner
         self.supervisor = Supervisor(limits, state)
         self.tick = 0  # the planner tick of the next observation, or of the pending action
-        self.sent: Array = np.zeros(robot.action_dim)  # a_{t-1}, (7,)
+        self.sent: Array = np.zeros(robot.action_dim)  # a_{t-1}, (A,)
         self._safety = SafetyFilter(1, robot.action_dim)
         self.plans = PlanBuffer()
         repeats = not robot.is_g1
         self._proprioception, self._image = Freshness(repeats), Freshness(repeats)
-        self._tilt, self._height = 0.0, 0.74
-        self._unanswered: deque[ObservationMessage] = deque(maxlen=64)
+        self._tilt, self._height = 0.0, 0.74  # rad, m; see `Facts`
+        self._unanswered: deque[tuple[int, int]] = deque()  # tick and time of observations, ns
         self._first = True  # the next observation restarts the recurrence
         self._restart_tick = 0  # tick of that observation; older plans are ignored
         self._events: list[str] = []
@@ -193,7 +195,7 @@ class Pilot:
         ``state_ns`` (None: now), and a depth image (48, 64), which arrived at ``depth_ns``."""
         measured = None if state is None else np.asarray(state)
         if measured is not None and self._robot.is_g1:
-            measured = np.delete(measured, COMMAND_SLICE)
+            measured = np.delete(measured, COMMAND_SLICE)  # ours: changes with dead sensors, too
         self._proprioception.update(now_ns if state_ns is None else state_ns, measured)
         self._image.update(now_ns if depth_ns is None else depth_ns, depth)
         if self._robot.is_g1 and measured is not None and np.isfinite(measured).all():
@@ -207,7 +209,7 @@ class Pilot:
             facts,
             state_age_s=self._proprioception.age_s(now_ns),
             image_age_s=self._image.age_s(now_ns),
-            planner_silence_s=(now_ns - waiting[0].time_ns) / 1e9 if waiting else 0.0,
+            planner_silence_s=(now_ns - waiting[0][1]) / 1e9 if waiting else 0.0,
             misses=self.plans.misses,
             tilt=self._tilt,
             height=self._height,
@@ -238,7 +240,8 @@ class Pilot:
         motors: MotorReadings | None = None,
         link: Mapping[str, float] | None = None,
     ) -> None:
-        """Send o_t to the planner, with ``events``, ``motors`` and ``link`` for its log."""
+        """Send o_t, depth (48, 64) mm and state (74,), to the planner, with ``events``, ``motors``
+        and ``link`` for its log."""
         if self._first:
             self._restart_tick = self.tick
         observation = ObservationMessage(
@@ -254,29 +257,31 @@ class Pilot:
             link or {},
         )
         self._first = False
-        self._unanswered.append(observation)
+        self._unanswered.append((self.tick, now_ns))
         self._planner.submit(observation)
 
     def receive_plans(self, now_ns: int) -> PlanMessage | None:
-        """Take the plans that have arrived by ``now_ns``; returns that of this tick, if any."""
+        """Take the plans that have arrived by ``now_ns``; returns that of this tick, if any, even
+        if its actions are rejected."""
         current = None
         for plan in self._planner.poll(now_ns):
-            if plan.tick > self.tick:  # it would outlast all valid plans
+            if plan.tick > self.tick:  # it would make all later plans `OUTDATED`
                 self._events.append(UNREQUESTED)
                 continue
-            while self._unanswered and self._unanswered[0].tick <= plan.tick:
+            while self._unanswered and self._unanswered[0][0] <= plan.tick:
                 self._unanswered.popleft()
             self._events += plan.events
             if self._first or plan.tick < self._restart_tick:
                 continue
             if not self.plans.offer(plan.tick, plan.actions):
-                self._events.append(REJECTED)
+                finite = np.isfinite(plan.actions).all()
+                self._events.append(OUTDATED if finite else REJECTED)
             if plan.tick == self.tick:
                 current = plan
         return current
 
     def next_action(self) -> Array:
-        """a_t (7,); call it once per tick. The next tick begins."""
+        """a_t (A,); call it once per tick. The next tick begins."""
         wanted = self.plans.action(self.tick)
         if self.supervisor.state is not State.RUN or self._first:
             self.sent = self._safety.ease()[0]

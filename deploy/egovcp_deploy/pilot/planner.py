@@ -149,7 +149,7 @@ class AdaptiveBudget:
     configuration ``full``, when it does not.
 
     A plan cut short by its deadline has too few iterations; fewer samples in all iterations are
-    better than many samples in one (`docs/log.md`).
+    better than many samples in one.
     """
 
     def __init__(self, full: PlannerConfig) -> None:

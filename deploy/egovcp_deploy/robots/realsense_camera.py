@@ -38,7 +38,8 @@ class RealSenseConfig:
     """RealSense camera and its mode."""
 
     serial: str = ""
-    """Serial number, or name if it is unique; lerobot-find-cameras realsense lists them."""
+    """Serial number, or name if it is unique; lerobot-find-cameras realsense lists them.
+    Required."""
     width: int = bounded(848, least=1, most=8192)
     """Columns of the depth image; the stereo of a D435i is best at 848 x 480."""
     height: int = bounded(480, least=1, most=8192)
@@ -98,7 +99,7 @@ class DepthResampler:
 
 class RealSenseDepthCamera:
     """Reads LeRobot's ``RealSenseCamera``, which is connected and has its own thread; raises
-    `EnvironmentFailure` if its field of view is smaller than the policy's."""
+    `EnvironmentFailure` if it covers less than 90 % of the policy's field of view."""
 
     def __init__(self, driver: Any, intrinsics: Any, vertical_fov: float) -> None:
         self._driver: Any | None = driver
@@ -106,8 +107,8 @@ class RealSenseDepthCamera:
         if self._resample.coverage < _MIN_COVERAGE:
             raise EnvironmentFailure(
                 f"the camera covers {self._resample.coverage:.0%} of the policy's field of view, "
-                f"expected at least {_MIN_COVERAGE:.0%}; choose a wider mode of it, or a policy "
-                "that was trained with its field of view"
+                f"expected at least {_MIN_COVERAGE:.0%}; choose a wider mode (width, "
+                "height), or a policy trained with a smaller vertical_fov, and set that"
             )
         self._raw: NDArray[np.uint16] | None = None
         self._newest: DepthImage | None = None
@@ -120,8 +121,9 @@ class RealSenseDepthCamera:
         no such camera."""
         if not config.serial:
             raise EnvironmentFailure(
-                "no camera was named; give its serial number, which lerobot-find-cameras realsense "
-                "prints"
+                "no camera is named: give its serial number, --robot.camera.realsense.serial "
+                "(egovcp-deploy) or --camera.serial (egovcp-depth-server); lerobot-find-cameras "
+                "realsense prints it"
             )
         require_realsense()
         import pyrealsense2 as rs
@@ -144,6 +146,7 @@ class RealSenseDepthCamera:
                 "realsense, and its USB 3 cable"
             ) from error
         try:
+            require_millimetres(driver.rs_profile)
             stream = driver.rs_profile.get_stream(rs.stream.depth).as_video_stream_profile()
             return cls(driver, stream.get_intrinsics(), config.vertical_fov)
         except BaseException:
@@ -151,7 +154,8 @@ class RealSenseDepthCamera:
             raise
 
     def read(self) -> DepthImage | None:
-        """Return the newest image; its time is when the driver received it, if known."""
+        """Return the newest image; its time is when the driver received it, else that of
+        this call. None before the first image."""
         if self._driver is None:
             return self._newest
         now_ns = time.monotonic_ns()
@@ -177,6 +181,16 @@ class RealSenseDepthCamera:
         driver, self._driver = self._driver, None
         if driver is not None:
             driver.disconnect()
+
+
+def require_millimetres(profile: Any) -> None:
+    """Raise `EnvironmentFailure` unless the camera's depth is in mm, as that of a D435i is."""
+    scale = float(profile.get_device().first_depth_sensor().get_depth_scale())  # m
+    if not math.isclose(scale, 1e-3, rel_tol=1e-3):
+        raise EnvironmentFailure(
+            f"the camera reports depth in units of {scale * 1000:g} mm, expected 1 mm; set its "
+            "depth units to 1000 um"
+        )
 
 
 def require_realsense() -> None:

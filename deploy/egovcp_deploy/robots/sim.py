@@ -1,4 +1,4 @@
-"""The simulated robot: one row of `VectorEnv` in lock-step."""
+"""A simulated robot in lock-step: a `BaseVectorEnv` with one row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from egovcp.spec import ACTION_TERMS, Solid
 from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
-#: Reward term -> event that is logged when the term is first nonzero in an episode.
+#: Reward term -> event that is logged when the term is first nonzero in an episode; other terms
+#: are logged by name.
 _TERM_EVENTS: Final = {
     "block": "blocked by a hand",
     "hit": "body hit",
@@ -61,7 +62,7 @@ class SimRobot:
         return RobotObservation(self._observation.depth[0], self._observation.state[0], *poses)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
-        """Apply ``action`` for 40 ms of simulated time."""
+        """Apply ``action`` (A,) for one planner tick, 40 ms of the G1."""
         result = self.env.step(action[None])
         self._observation = result.observation
         terms = {name: float(values[0]) for name, values in result.reward_terms.items()}

@@ -31,7 +31,7 @@ from .conftest import PATIENT, QUICK
 _PROGRAM = """
 import signal, sys
 from egovcp_deploy.commands import deploy
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores SIGHUP, and the test sends it
 sys.exit(deploy())
 """
 #: The planner raises once it has driven for a while.
@@ -50,8 +50,8 @@ planner.PlannerRunner.plan = failing
 
 
 @dataclass
-class Stand:
-    """A fake robot whose time passes, and a program that drives it."""
+class LiveRun:
+    """A fake G1 that a thread steps in real time, and a program that drives it."""
 
     fake: FakeBridge
     program: subprocess.Popen[str]
@@ -74,24 +74,24 @@ class Stand:
             return State.RUN in self.modes() or self.program.poll() is not None
 
         assert eventually(over)
-        assert self.program.poll() is None, self.end()
+        assert self.program.poll() is None, self.stderr()
 
     def modes(self) -> list[str]:
-        """Of the ticks that are in the recording by now."""
+        """Mode of each tick recorded so far."""
         try:
             recording = read_recording(self.folder / "rollout-0.mcap")
         except DataError:  # nothing has been written yet
             return []
         return [tick.mode for tick in recording.ticks]
 
-    def end(self) -> str:
-        """Its last words."""
+    def stderr(self) -> str:
+        """Wait for the end; returns stderr."""
         return self.program.communicate(timeout=240)[1]
 
 
 @pytest.fixture
 def fake(robot: LiveRobot) -> Iterator[FakeBridge]:
-    """Its time passes."""
+    """A fake G1 that a thread steps in real time."""
     robot.start(Scenario("ball", 0, 0))
     found = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
     running = FakeG1Thread(found)
@@ -103,23 +103,29 @@ def fake(robot: LiveRobot) -> Iterator[FakeBridge]:
 type Start = Callable[..., subprocess.Popen[str]]
 
 
+def _command(artifact: Path, output: Path, *flags: str, before: str = "") -> list[str]:
+    """Command line of a run; ``before`` is executed first."""
+    return [
+        *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
+        *(f"--policy.path={artifact}", f"--output_dir={output}", "--robot.controller=stance"),
+        *flags,
+    ]
+
+
 @pytest.fixture
 def start(artifact_dir: Path, tmp_path: Path) -> Iterator[Start]:
     """Starts a run of a tiny planner, recorded in ``tmp_path / "run"``."""
     programs = list[subprocess.Popen[str]]()
 
     def start(ports: Ports, *flags: str, before: str = "") -> subprocess.Popen[str]:
-        command = [
-            *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
-            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
-            *("--robot.controller=stance", "--log.rrd=false", "--log.videos=0"),
+        options = [
+            *("--log.rrd=false", "--log.videos=0"),
             f"--robot.bridge.state_port={ports.state_port}",
             f"--robot.bridge.command_port={ports.command_port}",
             f"--robot.camera.server.port={ports.camera_port}",
-            *QUICK,
-            *PATIENT,
-            *flags,
+            *(*QUICK, *PATIENT, *flags),
         ]
+        command = _command(artifact_dir, tmp_path / "run", *options, before=before)
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         program = subprocess.Popen(
             command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
@@ -136,42 +142,42 @@ def start(artifact_dir: Path, tmp_path: Path) -> Iterator[Start]:
 
 
 @pytest.fixture
-def drive(fake: FakeBridge, start: Start, tmp_path: Path) -> Callable[..., Stand]:
-    def drive(*flags: str, before: str = "") -> Stand:
-        return Stand(fake, start(fake.ports, *flags, before=before), tmp_path / "run")
+def drive(fake: FakeBridge, start: Start, tmp_path: Path) -> Callable[..., LiveRun]:
+    def drive(*flags: str, before: str = "") -> LiveRun:
+        return LiveRun(fake, start(fake.ports, *flags, before=before), tmp_path / "run")
 
     return drive
 
 
 @pytest.mark.slow
 def test_a_run_stands_up_runs_holds_and_leaves_the_motors_damped(
-    drive: Callable[..., Stand],
+    drive: Callable[..., LiveRun],
 ) -> None:
-    stand = drive("--operator.duration=1", "--log.videos=1")
-    words = stand.end()
-    assert stand.program.returncode == 0, words
-    modes = stand.modes()
+    run = drive("--operator.duration=1", "--log.videos=1")
+    stderr = run.stderr()
+    assert run.program.returncode == 0, stderr
+    modes = run.modes()
     order = [State.INIT, State.STAND, State.ARMED, State.RUN, State.HOLD]
     assert list(dict.fromkeys(modes)) == order
-    assert not stand.holds
-    report = json.loads((stand.folder / "deploy.json").read_text())
+    assert not run.holds
+    report = json.loads((run.folder / "deploy.json").read_text())
     assert report["ticks_running"] == pytest.approx(modes.count(State.RUN), abs=1)
     assert report["damped"] == ""
     assert report["missing_ticks"] == {"rollout-0.mcap": 0, "rollout-0.gif": 0}
 
 
 def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop(
-    drive: Callable[..., Stand],
+    drive: Callable[..., LiveRun],
 ) -> None:
-    stand = drive()
-    stand.await_run()
-    assert stand.holds
-    stand.control.kill()
-    assert eventually(lambda: not stand.holds)
-    words = stand.end()
-    assert stand.program.returncode == 6, words
-    assert "the control process died" in words
-    recording = read_recording(stand.folder / "rollout-0.mcap")
+    run = drive()
+    run.await_run()
+    assert run.holds
+    run.control.kill()
+    assert eventually(lambda: not run.holds)
+    stderr = run.stderr()
+    assert run.program.returncode == 6, stderr
+    assert "the control process died" in stderr
+    recording = read_recording(run.folder / "rollout-0.mcap")
     assert recording.complete
     assert recording.ticks[-1].events[-1] == "end of the run: the control process is gone"
 
@@ -181,96 +187,88 @@ def kill(program: subprocess.Popen[str]) -> None:
 
 
 def hang_up(program: subprocess.Popen[str]) -> None:
-    """What closing its terminal does."""
+    """Send SIGHUP, as a closing terminal does."""
     os.killpg(program.pid, signal.SIGHUP)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("end", [kill, hang_up])
 def test_killing_the_planner_leaves_the_robot_standing_until_sigterm(
-    drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
+    drive: Callable[..., LiveRun], end: Callable[[subprocess.Popen[str]], None]
 ) -> None:
-    stand = drive()
-    stand.await_run()
-    control = stand.control
-    others = psutil.Process(stand.program.pid).children(recursive=True)
+    run = drive()
+    run.await_run()
+    control = run.control
+    others = psutil.Process(run.program.pid).children(recursive=True)
     commands = {p.pid: " ".join(p.cmdline()) for p in others}
-    end(stand.program)
-    stand.program.wait()
+    end(run.program)
+    run.program.wait()
     received: list[bytes] = []
-    stand.fake.on_command = received.append
+    run.fake.on_command = received.append
     assert eventually(lambda: len(received) > 50)
-    assert stand.holds
+    assert run.holds
     needed = {control.pid, *(p.pid for p in others if "resource_tracker" in commands[p.pid])}
     assert not psutil.wait_procs([p for p in others if p.pid not in needed], timeout=60)[1]
     control.terminate()
     assert eventually(lambda: not control.is_running() or control.status() == "zombie")
-    assert not stand.holds
-    assert f"damped: by kill {control.pid}" in stand.end()
+    assert not run.holds
+    assert f"damped: by kill {control.pid}" in run.stderr()
     assert not psutil.wait_procs(others, timeout=60)[1]
-    recording = read_recording(stand.folder / "rollout-0.mcap")
+    recording = read_recording(run.folder / "rollout-0.mcap")
     assert State.RUN in [tick.mode for tick in recording.ticks]
 
 
 @pytest.mark.slow
 def test_a_planner_exception_leaves_the_robot_standing_until_the_second_interrupt(
-    drive: Callable[..., Stand],
+    drive: Callable[..., LiveRun],
 ) -> None:
-    stand = drive(before=_FAILING)
-    assert eventually(lambda: stand.modes()[-1:] == [State.HOLD])
-    ticks = len(stand.modes())
-    stand.program.send_signal(signal.SIGINT)
-    assert eventually(lambda: len(stand.modes()) > ticks + 25)
-    assert stand.modes()[-1] == State.HOLD
-    assert stand.holds
-    stand.program.send_signal(signal.SIGINT)
-    assert eventually(lambda: not stand.holds)
-    words = stand.end()
-    assert stand.program.returncode == 6, words
-    assert "the planner failed: ZeroDivisionError: a mistake" in words
-    assert "Traceback" not in words
-    report = json.loads((stand.folder / "deploy.json").read_text())
+    run = drive(before=_FAILING)
+    assert eventually(lambda: run.modes()[-1:] == [State.HOLD])
+    ticks = len(run.modes())
+    run.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: len(run.modes()) > ticks + 25)
+    assert run.modes()[-1] == State.HOLD
+    assert run.holds
+    run.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: not run.holds)
+    stderr = run.stderr()
+    assert run.program.returncode == 6, stderr
+    assert "the planner failed: ZeroDivisionError: a mistake" in stderr
+    assert "Traceback" not in stderr
+    report = json.loads((run.folder / "deploy.json").read_text())
     assert report["failure"] == "ZeroDivisionError: a mistake"
 
 
-def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand]) -> None:
-    stand = drive()
-    stand.await_run()
-    stand.program.send_signal(signal.SIGINT)
-    assert eventually(lambda: stand.modes()[-1] == State.HOLD)
-    assert stand.holds
-    stand.program.send_signal(signal.SIGINT)
-    assert eventually(lambda: not stand.holds)
-    words = stand.end()
-    assert stand.program.returncode == 6, words
-    assert "emergency stop" in words
+def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., LiveRun]) -> None:
+    run = drive()
+    run.await_run()
+    run.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: run.modes()[-1] == State.HOLD)
+    assert run.holds
+    run.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: not run.holds)
+    stderr = run.stderr()
+    assert run.program.returncode == 6, stderr
+    assert "emergency stop" in stderr
 
 
 @pytest.mark.slow
-def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
-    drive: Callable[..., Stand],
+def test_missing_robot_states_damp_and_exit_with_a_safety_stop(
+    drive: Callable[..., LiveRun],
 ) -> None:
-    stand = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
-    stand.await_run()
-    stand.fake.faults.freeze_state = True
-    assert eventually(lambda: not stand.holds)
-    words = stand.end()
-    assert stand.program.returncode == 6, words
-    assert "no new proprioception" in words
+    run = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
+    run.await_run()
+    run.fake.faults.freeze_state = True
+    assert eventually(lambda: not run.holds)
+    stderr = run.stderr()
+    assert run.program.returncode == 6, stderr
+    assert "no new proprioception" in stderr
 
 
 @pytest.mark.slow
 def test_a_missing_robot_is_reported_at_once(artifact_dir: Path, tmp_path: Path) -> None:
-    result = subprocess.run(
-        [
-            *(sys.executable, "-c", _PROGRAM, "--robot.type=unitree_g1"),
-            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
-            *("--robot.controller=stance", "--robot.bridge.state_port=1"),
-        ],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = _command(artifact_dir, tmp_path / "run", "--robot.bridge.state_port=1")
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert result.returncode == 5
     assert "egovcp-fake-g1" in result.stderr
     assert "Traceback" not in result.stderr
@@ -285,8 +283,8 @@ def test_an_episode_of_the_fake_g1_is_played_and_recorded(
     with fake_g1_process(*short, "--pause=60", f"--json={outcomes}") as fake:
         program = start(fake.ports)
         assert eventually(lambda: outcomes.is_file() or program.poll() is not None)
-    words = program.communicate(timeout=240)[1]
-    assert program.returncode == 6, words  # the robot is gone
+    stderr = program.communicate(timeout=240)[1]
+    assert program.returncode == 6, stderr  # the robot is gone
     recording = read_recording(tmp_path / "run" / "rollout-0.mcap")
     assert recording.complete
     assert State.RUN in {tick.mode for tick in recording.ticks}
@@ -294,16 +292,23 @@ def test_an_episode_of_the_fake_g1_is_played_and_recorded(
     assert outcome["ticks"] == 15
 
 
-def test_a_killed_run_leaves_no_process_and_listens_nowhere(drive: Callable[..., Stand]) -> None:
-    stand = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
-    assert eventually(lambda: len(stand.modes()) > 3)
-    program = psutil.Process(stand.program.pid)
-    children = program.children(recursive=True)
-    assert len(children) >= 2  # control, log
-    connections = [c for p in (program, *children) for c in p.net_connections(kind="inet")]
+def test_a_run_opens_no_listening_socket(drive: Callable[..., LiveRun]) -> None:
+    run = drive()
+    assert eventually(lambda: len(run.modes()) > 3)
+    program = psutil.Process(run.program.pid)
+    processes = (program, *program.children(recursive=True))
+    connections = [c for p in processes for c in p.net_connections(kind="inet")]
     assert connections  # with the robot
     assert psutil.CONN_LISTEN not in {connection.status for connection in connections}
-    stand.program.kill()
-    stand.fake.faults.freeze_state = True  # a robot that may stand is held, not abandoned
+
+
+def test_a_killed_run_ends_all_its_processes(drive: Callable[..., LiveRun]) -> None:
+    run = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
+    assert eventually(lambda: len(run.modes()) > 3)
+    children = psutil.Process(run.program.pid).children(recursive=True)
+    assert len(children) >= 2  # control, log
+    run.program.kill()
+    # the control process ends only once the robot no longer answers
+    run.fake.faults.freeze_state = True
     assert not psutil.wait_procs(children, timeout=300)[1]
-    assert not stand.holds
+    assert not run.holds

@@ -27,6 +27,7 @@ from egovcp_deploy.robots.realsense_camera import (
     DepthResampler,
     RealSenseConfig,
     RealSenseDepthCamera,
+    require_millimetres,
 )
 from egovcp_deploy.robots.wire import MalformedMessage
 from egovcp_deploy.robots.zmq_camera import (
@@ -247,6 +248,17 @@ def test_a_narrow_camera_is_refused(driver: FakeRealSense) -> None:
     narrow = Intrinsics(848, 480, 700.0, 700.0, 423.5, 239.5)
     with pytest.raises(EnvironmentFailure, match="wider mode"):
         RealSenseDepthCamera(driver, narrow, FOV)
+
+
+def test_a_camera_whose_depth_is_not_in_millimetres_is_refused() -> None:
+    def profile(scale: float) -> SimpleNamespace:
+        sensor = SimpleNamespace(get_depth_scale=lambda: scale)
+        device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+        return SimpleNamespace(get_device=lambda: device)
+
+    require_millimetres(profile(0.0010000000474974513))
+    with pytest.raises(EnvironmentFailure, match=r"units of 0\.1 mm, expected 1 mm"):
+        require_millimetres(profile(1e-4))
 
 
 @pytest.mark.skipif(find_spec("pyrealsense2") is not None, reason="the driver is installed")
