@@ -5,8 +5,8 @@ A command is a dataclass of options and a function::
     def main(argv: Sequence[str] | None = None) -> int:
         return run_command(CollectConfig, collect, argv, prog="egovcp-collect")
 
-Exit codes: see `egovcp.errors`; 130 after an interrupt; 1 after a bug, which prints a traceback.
-Errors that a user caused print one only with ``--debug``.
+Exit codes: see `egovcp.errors`; 130 after an interrupt; 141 if the reader of the output closed it;
+1 after a bug, with a traceback. For errors that a user caused ``--debug`` prints it, too.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from egovcp.outputs import check_output_files
 from egovcp.terminal import echo, one_line, without_token
 from egovcp.values import WrongValue, build
 
+_DEBUG: Final = {"--debug": True, "--debug=true": True, "--debug=false": False}
+
 type Defaults = Callable[[Sequence[str]], Mapping[str, Any]]
 """Flags, each as ``--name=value`` -> nested default values."""
 
@@ -44,7 +46,8 @@ def parse_config[C](
     """Parse dotted flags into ``config_class``.
 
     A flag without a value is true (``--resume`` is ``--resume=true``). A list is written
-    ``[a, b]`` or ``(a, b)``. Flags and the config file override ``defaults``.
+    ``[a, b]`` or ``(a, b)``. Flags and the config file override ``defaults``, which is called with
+    the flags. The help ends with ``epilog``.
 
     Raises:
         EgovcpError: a value is invalid; the message names the flag.
@@ -56,8 +59,8 @@ def parse_config[C](
         if topics:
             echo(help_text(config_class, prog, epilog, topics[-1]))
             raise SystemExit(0)
-        beneath = defaults(args) if defaults else {}
-        config = build(config_class, merged(beneath, flag_values(args, config_class)), "--")
+        default_values = defaults(args) if defaults else {}
+        config = build(config_class, merged(default_values, flag_values(args, config_class)), "--")
     except WrongValue as error:
         raise UsageError(f"{error}; see {prog} --help") from None
     check_bounds(config, "--")
@@ -80,11 +83,11 @@ def run_command[C](
     `EntryPoint` handles missing packages and closed pipes.
     """
     args = list(sys.argv[1:] if argv is None else argv)
-    switch = ("--debug", "--debug=true")
-    debug = any(a in switch for a in args)
+    given = [a for a in args if a in _DEBUG]
+    debug = bool(given) and _DEBUG[given[-1]]
     raise_on_sigint()
     try:
-        plain = [a for a in args if a not in switch]
+        plain = [a for a in args if a not in _DEBUG]
         config = parse_config(config_class, plain, prog, epilog, defaults)
         run(config)
     except KeyboardInterrupt:

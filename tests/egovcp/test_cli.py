@@ -345,6 +345,8 @@ def test_an_error_is_one_line_and_a_traceback_only_with_debug(
     for argv in (["--debug"], ["--count=2", "--debug"], ["--debug", "--loud"], ["--debug=true"]):
         assert _run(*argv, error=error) > 0
         assert "Traceback" in capsys.readouterr().err
+    assert _run("--debug", "--debug=false", error=error) > 0
+    assert "Traceback" not in capsys.readouterr().err
 
 
 def test_debug_is_no_option_of_the_command_itself() -> None:

@@ -33,7 +33,9 @@ def mixed(arguments: Arguments, dataset_root: Path, tmp_path: Path) -> Arguments
     return build
 
 
-def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Path) -> None:
+def test_a_resumed_run_on_two_datasets_continues_the_stream(
+    mixed: Arguments, tmp_path: Path
+) -> None:
     straight, resumed = tmp_path / "straight", tmp_path / "resumed"
     assert main(mixed(straight, "--sampling.tasks={ball: 2}")) == 0
     assert main(mixed(resumed, "--sampling.tasks={ball: 2}", "--steps=3")) == 0
@@ -56,7 +58,7 @@ def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Pa
         (("1", "1"), ["--returns.steps=0"], "--returns.steps=0"),
     ],
 )
-def test_a_mixture_that_makes_no_sense_is_refused_before_anything_is_written(
+def test_invalid_mixtures_are_refused_before_output_is_written(
     mixed: Arguments,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -87,7 +89,9 @@ def test_dataset_without_a_complete_return_beside_others_is_refused(
 
 
 # --- from the disk ----------------------------------------------------------------------------
-def test_a_run_from_the_disk_is_resumed_exactly(arguments: Arguments, tmp_path: Path) -> None:
+def test_a_resumed_run_from_the_disk_continues_the_stream(
+    arguments: Arguments, tmp_path: Path
+) -> None:
     def argv(name: str, **options: object) -> list[str]:
         window = {"loading__mode": "stream", "loading__shuffle__episodes": 3}
         return arguments(tmp_path / name, **window, **options)
@@ -115,7 +119,7 @@ def test_the_statistics_from_the_disk_are_those_from_memory(
 
 
 @pytest.mark.parametrize(("available", "mode"), [(10**12, "ram"), (10**5, "stream")])
-def test_what_fits_into_memory_is_kept_there_and_a_resumed_run_keeps_to_it(
+def test_auto_mode_is_recorded_and_kept_on_resume(
     arguments: Arguments,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -132,7 +136,7 @@ def test_what_fits_into_memory_is_kept_there_and_a_resumed_run_keeps_to_it(
 
 # --- faults -----------------------------------------------------------------------------------
 def _rewritten(root: Path, change: Callable[[pa.Table], pa.Table]) -> None:
-    """Change the data, and forget every hash by which that would be noticed."""
+    """Change the data and remove the recorded hashes."""
     (path,) = (root / "data").rglob("*.parquet")
     pq.write_table(change(pq.read_table(path)), path)
     collection = root / "meta" / "collection.json"

@@ -21,8 +21,8 @@ PLANNER = PlannerConfig(samples=64, elites=8, horizon=4, iterations=2)
 PROVENANCE = {
     "controller_id": "stance-1",
     "tasks": ["ball"],
-    "command": ["/opt/venv/bin/egovcp-train", "--dataset.root=/home/me/data/all", "--steps=2"],
-    "train_config": {"dataset": {"root": "/home/me/data/all"}, "output_dir": "runs/all"},
+    "command": ["/opt/venv/bin/egovcp-train", "--dataset.root=/home/me too/data/all", "--steps=2"],
+    "train_config": {"dataset": {"root": "/home/me too/data/all"}, "output_dir": "runs/all"},
     "datasets": [{"repo_id": "me/ball", "revision": None, "episodes": ""}],
     "heldout": {"value/r2": 0.5},
 }
@@ -92,6 +92,17 @@ def test_it_has_a_card_and_the_curves_of_the_training(half: Path) -> None:
     assert publish.CURVES in card
     assert (half / publish.CURVES).read_bytes() == b"curves"
     assert "/home/me" not in card
+
+
+@pytest.mark.parametrize("output", ["contact", "~/contact"])
+def test_the_card_describes_the_copy_even_if_its_folder_has_the_name_of_a_shipped_policy(
+    single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main([f"--policy.path={single}", f"--output_dir={output}"]) == 0
+    card = (tmp_path / "contact" / publish.CARD).read_text()
+    assert f"--policy.path={tmp_path / 'contact'} --task=ball" in card
 
 
 def test_the_card_of_a_shipped_policy_has_its_name(

@@ -166,7 +166,7 @@ def test_recorded_steps_learn_the_same_bit_for_bit(
         assert found.keys() == expected.keys()
         assert all(found[name].equal(value) for name, value in expected.items())
     assert _same(_weights(plain), _weights(recorded))
-    assert 1 < recorder.made < 12  # one for each row that may be the first
+    assert 1 < recorder.captures < 12  # one for each row that may be the first
     assert not recorded.capture_error
 
 

@@ -89,7 +89,7 @@ def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Pat
         UsageError: the folder exists and is not empty.
         EnvironmentFailure: it is not writable.
     """
-    output = Path(output_dir)
+    output = Path(os.path.expanduser(output_dir))
     if resume:
         with _open_training_state(output):  # loaded later
             return output

@@ -1,4 +1,4 @@
-"""``egovcp-export``: a policy with weights in half precision, half the size, for shipping."""
+"""``egovcp-export``: a policy with weights in half precision, for shipping."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import torch
@@ -27,6 +27,7 @@ from egovcp_train.publish import CARD, CURVES, card_text
 PROG = "egovcp-export"
 SOURCE: Final = "half_precision_of"
 """Entry of the manifest: SHA-256 of the weights before rounding."""
+_FLAG: Final = re.compile(r"(--[\w.-]+=|)(.*)", re.DOTALL)
 _PARENT_FOLDERS: Final = re.compile(r"(?<![\w.~/:])/(?:[^\s/\"'\[\]{},]+/)+(?=[^\s/])")
 
 
@@ -51,11 +52,12 @@ def export(config: ExportConfig) -> None:
     Raises:
         UsageError: policy or folder are missing, or the folder is not empty.
         ArtifactError: the policy is damaged, or a weight exceeds the range of float16.
-        EnvironmentFailure: the folder cannot be written.
+        EnvironmentFailure: the folder cannot be written, or the Hub cannot be reached.
     """
     if not config.policy.path or not config.output_dir:
         raise UsageError("--policy.path and --output_dir are needed: the policy, and a new folder")
-    output = prepare_output(config.output_dir, resume=False, resumable=False)
+    # Absolute: a relative path could be the name of a shipped policy, or have no last component.
+    output = prepare_output(config.output_dir, resume=False, resumable=False).absolute()
     artifact = load_artifact(config.policy.path, config.policy.revision)
     with removed_on_error(output.with_name(output.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)
@@ -112,7 +114,9 @@ def _without_folders(value: Any) -> Any:
     """A JSON value with absolute paths in its strings replaced by their last component."""
     match value:
         case str():
-            return _PARENT_FOLDERS.sub("", value)
+            flag, path = _FLAG.fullmatch(value).groups()  # type: ignore[union-attr]  # never None
+            name = PurePosixPath(path).name if path.startswith("/") else ""
+            return f"{flag}{name or _PARENT_FOLDERS.sub('', path)}"
         case Mapping():
             return {key: _without_folders(item) for key, item in value.items()}
         case list():

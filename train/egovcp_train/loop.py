@@ -22,8 +22,8 @@ from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.privileged_value import Critic
 
-_MOST_GRAPHS: Final = 64
-"""At most one graph per combination of the integers in `StepNoise`; the default recipe has 8."""
+_MAX_GRAPHS: Final = 64
+"""Most captured graphs: one per combination of the integers in `StepNoise`, 8 by default."""
 _CRITIC_START: Final = 0.1
 """Part of the run before the critic is updated: until then Q, which chooses the critic's next
 action, cannot rank actions."""
@@ -52,8 +52,10 @@ class Learner:
         """
         Args:
             model: the networks, which are trained in place.
+            config: learning rate, regularisation and averaging.
+            seed: seed of the random stream of the steps.
             bf16: compute matrix products in bfloat16.
-            planner: costs of the actions that the critic plans.
+            planner: its costs choose the critic's next action; None: the defaults.
         """
         self.model = model
         self.config = config
@@ -73,12 +75,12 @@ class Learner:
         self._gradients: Callable[[Batch, StepNoise], Gradients] = self._compute_gradients
         if device.type == "cuda":
             self._gradients = GraphedFunction(
-                self._compute_gradients, max_graphs=_MOST_GRAPHS, copies=False
+                self._compute_gradients, max_graphs=_MAX_GRAPHS, copies=False
             )
 
     @property
     def capture_error(self) -> str:
-        """Why a step could not be captured on this GPU; empty if it was."""
+        """Error of the last capture of a step that failed; empty: none failed."""
         return self._gradients.error if isinstance(self._gradients, GraphedFunction) else ""
 
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
@@ -125,7 +127,7 @@ class Learner:
         return tuple(terms), torch.stack(list(terms.values())), gradients, states
 
     def learning_rate(self, progress: float) -> float:
-        """Linear warm-up, then cosine decay to a tenth of the peak."""
+        """lr * min(1, step / warmup_steps) * (0.1 + 0.45 (1 + cos(pi progress)))."""
         warm = min(1.0, (self.step + 1) / max(1, self.config.warmup_steps))
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
         return self.config.lr * warm * (0.1 + 0.9 * cosine)
@@ -144,7 +146,8 @@ class Learner:
         """Count the step as good or skipped; returns whether it is taken.
 
         Args:
-            probe: sum of the losses and the norm of the gradient; not finite if one of them is not.
+            probe: sum of the losses and the norm of the model's gradient; not finite if one of them
+                is not. The critic's gradient is not included.
 
         Raises:
             DataError: `_MAX_SKIPPED` consecutive steps are skipped.
@@ -202,7 +205,11 @@ class Budget:
         clock: Callable[[], float] = time.monotonic,
         spent: float = 0.0,
     ) -> None:
-        """``spent``: seconds that the run took before it was resumed."""
+        """
+        Args:
+            max_minutes: time limit; 0: none.
+            spent: seconds that the run took before it was resumed.
+        """
         self.steps, self.seconds, self._clock = steps, 60 * max_minutes, clock
         self._start = clock() - spent
 

@@ -58,7 +58,7 @@ type Series = tuple[list[int], list[float]]
 # --- egovcp-push ---------------------------------------------------------------------
 @dataclass(frozen=True)
 class FolderConfig:
-    """Which policy."""
+    """The policy to publish."""
 
     path: str = ""
     """Folder of the artifact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run, or `contact`,
@@ -74,9 +74,9 @@ class PolicyPushConfig(PublishConfig):
     """
 
     policy: FolderConfig = field(default_factory=FolderConfig)
-    """The artifact."""
+    """Policy to publish."""
     message: str = ""
-    """Title of the commit; empty: how long it was trained."""
+    """Title of the commit; empty: `policy after N steps`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,7 +88,8 @@ def push(config: PolicyPushConfig) -> None:
     """Check and publish.
 
     Raises:
-        UsageError: the folder or the id is missing or wrong.
+        UsageError: the folder or the id is missing or wrong; the repository is public and
+            --private was given; the tag belongs to another commit.
         ArtifactError: the artifact is damaged.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
@@ -110,7 +111,9 @@ def push(config: PolicyPushConfig) -> None:
 
 # --- publication of a run ------------------------------------------------------------
 def reserve_policy(policy: PolicyConfig) -> None:
-    """Check before training that the policy can be published, if that is requested.
+    """Create the policy's repository on the Hub, or check that it can be written to.
+
+    Does nothing unless the policy is to be published.
 
     Raises:
         UsageError: the repository is public and a private one is requested.
@@ -165,7 +168,7 @@ def report(target: Publication, published: Published) -> None:
 
 
 # --- card ----------------------------------------------------------------------------
-def versions() -> dict[str, str]:
+def training_versions() -> dict[str, str]:
     """Versions of Python and of the packages that training depends on."""
     return {"python": platform.python_version(), **versions_of(_PACKAGES)}
 
@@ -285,8 +288,8 @@ def _datasets(manifest: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 # --- training curves -----------------------------------------------------------------
-def draw_curves(run: Path, path: Path) -> bool:
-    """Draw the curves of the run in folder ``run``; returns whether it has recorded any."""
+def draw_curves(run: Path, path: Path) -> None:
+    """Draw the curves that the run in folder ``run`` has recorded; no file if there are none."""
     known = recorded_scalars(run / "tensorboard")
     panels = {
         title: {label: known[name] for label, name in names.items() if name in known}
@@ -294,7 +297,7 @@ def draw_curves(run: Path, path: Path) -> bool:
     }
     panels = {title: curves for title, curves in panels.items() if curves}
     if not panels:
-        return False
+        return
     from matplotlib.figure import Figure  # takes half a second
 
     figure = Figure(figsize=(4.0 * len(panels), 3.0), layout="constrained")
@@ -308,7 +311,6 @@ def draw_curves(run: Path, path: Path) -> bool:
         axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100, metadata={"Software": None})
-    return True
 
 
 def recorded_scalars(folder: Path) -> dict[str, Series]:

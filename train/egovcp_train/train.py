@@ -58,7 +58,7 @@ from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
 from egovcp_train.loggers import Logger, TensorBoardLogger, TrackioLogger, WandbLogger
 from egovcp_train.loop import Budget, Learner
-from egovcp_train.publish import publish_trained, reserve_policy, versions, write_card
+from egovcp_train.publish import publish_trained, reserve_policy, training_versions, write_card
 
 PROG = "egovcp-train"
 EPILOG = (
@@ -375,7 +375,7 @@ def _provenance(data: TrainingData) -> dict[str, Any]:
     return {
         "controller_id": readers[0].controller_id,
         "tasks": sorted(set(EpisodeIndex.of(readers).tasks)),
-        "versions": versions(),
+        "versions": training_versions(),
         "datasets": [
             {"repo_id": r.source.repo_id, "revision": r.source.commit, "episodes": r.episodes}
             for r in readers

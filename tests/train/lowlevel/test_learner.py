@@ -1,4 +1,4 @@
-"""Training that starts from the network of a trained controller."""
+"""Start from a trained controller, and the warm-up of the critic."""
 
 import numpy as np
 import pytest
