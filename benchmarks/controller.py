@@ -78,8 +78,8 @@ def main() -> None:
             robots[key] = n
             cases[key] = repeated(step, x, args.steps)
     seconds = interleaved(cases, args.rounds)
-    figures = {key: 1e3 * taken / (args.steps * robots[key]) for key, taken in seconds.items()}
-    publish(figures | {"steps": args.steps}, args.json)
+    metrics = {key: 1e3 * taken / (args.steps * robots[key]) for key, taken in seconds.items()}
+    publish(metrics | {"steps": args.steps}, args.json)
 
 
 if __name__ == "__main__":

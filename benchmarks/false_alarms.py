@@ -19,11 +19,11 @@ from tests.support.robots.healthy_run import SITUATIONS, HealthyRun
 
 def main() -> None:
     p = parser(__doc__, rounds=None)
-    p.add_argument("--minutes", type=float, default=10.0, help="simulated time, all together")
-    p.add_argument("--seed", type=int, default=0, help="of the scenarios")
+    p.add_argument("--minutes", type=float, default=10.0, help="total simulated time, min")
+    p.add_argument("--seed", type=int, default=0, help="seed of the scenarios")
     args = p.parse_args()
     share = 60.0 * args.minutes / len(SITUATIONS)
-    figures: dict[str, object] = {}
+    metrics: dict[str, object] = {}
     total = dict.fromkeys(("seconds", "readings", "rejected", "alarms", "falls"), 0.0)
     for situation in SITUATIONS:
         healthy, episode = HealthyRun(situation, args.seed), 0
@@ -39,11 +39,11 @@ def main() -> None:
         }
         name = "".join(c if c.isalnum() else "_" for c in situation.name)
         for key, value in found.items():
-            figures[f"{name}_{key}"] = value
+            metrics[f"{name}_{key}"] = value
             total[key] += value
         for line in [*alarms.rejected[:5], *alarms.events[:5]]:
             print(f"{situation.name}: {line}", file=sys.stderr)
-    publish(figures | total, args.json)
+    publish(metrics | total, args.json)
     if total["rejected"] or total["alarms"] or total["falls"]:
         sys.exit(1)
 

@@ -2,6 +2,7 @@
 
 Sums the files of every distribution that the application requires, as installed in this
 environment; "without torch" leaves out torch, triton and the distributions nvidia-* and cuda-*.
+Of packages in editable mode, such as those of egovcp here, only the metadata count.
 
     python benchmarks/install_size.py
 """
@@ -33,13 +34,13 @@ def size_mb(name: str) -> float:
 
 def sizes_mb() -> dict[str, object]:
     """Size of every application, with and without torch."""
-    figures: dict[str, object] = {}
+    metrics: dict[str, object] = {}
     for application in APPLICATIONS:
         sizes = {name: size_mb(name) for name in installed_with(application)}
         without = sum(mb for name, mb in sizes.items() if not _TORCH.fullmatch(name))
-        figures[f"{application}_mb"] = sum(sizes.values())
-        figures[f"{application}_without_torch_mb"] = without
-    return figures
+        metrics[f"{application}_mb"] = sum(sizes.values())
+        metrics[f"{application}_without_torch_mb"] = without
+    return metrics
 
 
 if __name__ == "__main__":

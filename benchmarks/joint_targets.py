@@ -1,8 +1,9 @@
-"""How far each joint's target passes the joint's range: what `egovcp.robot.kinematics` allows.
+"""Largest excess of each joint's target over the joint's range, rad (negative: margin).
 
-Plays every task with both low-level controllers, once with random hands and once with the oracle
-(blocks, braces after pushes, walks under the arch). Robots that fall are left out, as targets
-during a fall are arbitrary.
+`egovcp.robot.kinematics` derives from it how far targets may leave the range. Plays every task of
+the G1 with each low-level controller that can play it, once with random hands and once with the
+oracle (blocks, braces after pushes, walks under the arch). Robots that fall are left out, as
+targets during a fall are arbitrary.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from egovcp.sim.config import evaluation_config
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import EnvPolicy, Oracle, RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks import task_names
+from egovcp.sim.tasks.registry import find_task, select_tasks
 from egovcp.spec import JOINT_NAMES
 
 Array = NDArray[np.float64]
@@ -38,7 +39,7 @@ class TargetRecorder:
 
     def step(self, state: NDArray[np.floating]) -> Array:
         target = self._controller.step(state)
-        if len(target) == len(self.above):
+        if len(target) == len(self.above):  # not the single robot that settles first
             self.below = np.maximum(self.below, JOINT_LOWER - target)
             self.above = np.maximum(self.above, target - JOINT_UPPER)
         return target
@@ -62,21 +63,25 @@ def excess(which: str, task: str, policy: EnvPolicy, robots: int, seed: int) -> 
 
 def main() -> None:
     p = parser(__doc__, rounds=None)
-    p.add_argument("--robots", type=int, default=16, help="episodes of each kind")
+    p.add_argument(
+        "--robots", type=int, default=16, help="episodes per controller, task and policy; 2 or more"
+    )
     p.add_argument("--seed", type=int, default=5, help="of the scenarios")
     args = p.parse_args()
     below = np.full(len(JOINT_NAMES), -np.inf)
     above = below.copy()
     for which in ("walk", "stance"):
-        for task in task_names(training=True):
+        for task in select_tasks("all", training=True):
+            if find_task(task).needs_walking and which != "walk":
+                continue
             for policy in (RandomWalk(), Oracle()):
                 found = excess(which, task, policy, args.robots, args.seed)
                 below, above = np.maximum(below, found[0]), np.maximum(above, found[1])
-    figures: dict[str, object] = {}
+    metrics: dict[str, object] = {}
     for i, name in enumerate(JOINT_NAMES):
-        figures[f"{name}_below_rad"] = float(below[i])
-        figures[f"{name}_above_rad"] = float(above[i])
-    publish(figures, args.json)
+        metrics[f"{name}_below_rad"] = float(below[i])
+        metrics[f"{name}_above_rad"] = float(above[i])
+    publish(metrics, args.json)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Prints a row per kind; docs/robot.md summarises them. Fails (exit code 1) if a reaction is not the
 required one, or if the 99th percentile of the time to DAMP of any kind with a DAMP deadline is
-above 250 ms. After Ctrl-C the runs so far are summed up (exit code 130).
+above 250 ms. After Ctrl-C the runs so far are summed up (exit code 130, or 1 if one had a problem).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 from report import parser, publish
 
 from egovcp.entry_point import INTERRUPTED
+from egovcp.hardware import available_cores
 from egovcp_deploy.live.control_process import raise_priority
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
@@ -94,7 +95,7 @@ def damp_p99(rows: Sequence[FaultRun]) -> dict[str, float | None]:
     }
 
 
-def figures(rows: Sequence[FaultRun], p99: dict[str, float | None]) -> dict[str, object]:
+def metrics(rows: Sequence[FaultRun], p99: dict[str, float | None]) -> dict[str, object]:
     """Metrics in one flat dict: per kind, and over all runs."""
     out: dict[str, object] = {"kinds": len({row.kind.name for row in rows}), "runs": len(rows)}
     for name in p99:
@@ -134,11 +135,14 @@ def main() -> None:
     )
     p.add_argument("--only", default="", help="kinds whose name contains this")
     p.add_argument(
-        "--load", type=int, default=os.cpu_count(), help="busy processes during the measurement"
+        "--load", type=int, default=available_cores(), help="busy processes during the measurement"
     )
     p.add_argument("--markdown", type=Path, help="also write the table to this file")
     args = p.parse_args()
     kinds = [kind for kind in FAULTS if args.only in kind.name]
+    if not kinds:
+        names = ", ".join(kind.name for kind in FAULTS)
+        p.error(f"--only={args.only}: no kind has this in its name; kinds: {names}")
     with cpu_load(args.load):
         # Raise the simulator's priority so that the reaction time excludes its scheduling delay.
         raise_priority(RIG_PRIORITY)
@@ -148,7 +152,7 @@ def main() -> None:
     if args.markdown is not None:
         args.markdown.write_text(table, encoding="utf-8")
     p99 = damp_p99(rows)
-    publish(figures(rows, p99) | {"load_processes": args.load}, args.json)
+    publish(metrics(rows, p99) | {"load_processes": args.load}, args.json)
     late = over_limit(rows, p99)
     problems = [f"{row.kind.name}: {row.problem}" for row in rows if row.problem]
     for line in [*problems, *late]:

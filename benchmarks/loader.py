@@ -1,9 +1,9 @@
-"""Training windows per second of the two streams and of LeRobot's dataset.
+"""Training windows per second of the two samplers and of LeRobot's dataset.
 
 The same dataset and windows of the same length, batch by batch, with one thread:
 
 * ``lerobot``: `LeRobotDataset` with `delta_timestamps` for every feature of a window, items at
-  random places, collated by torch;
+  random frames, collated by torch;
 * ``ram``: `egovcp.data.InMemorySampler`, all episodes in memory;
 * ``stream``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window.
 
@@ -99,18 +99,18 @@ def compare(
         {name: windows_per_second(stream, 1.0) for name, stream in streams.items()}
         for _ in range(rounds)
     ]
-    figures: dict[str, object] = {
+    metrics: dict[str, object] = {
         "episodes": len(index),
         "frames": index.num_frames,
-        "window": length,
+        "length": length,
         "batch": BATCH,
         "shuffle_episodes": shuffle.episodes,
         "shuffle_reuse": shuffle.reuse,
     }
-    figures |= {f"{k}_windows_per_s": statistics.median(r[k] for r in found) for k in streams}
+    metrics |= {f"{k}_windows_per_s": statistics.median(r[k] for r in found) for k in streams}
     for name in ("ram", "stream"):
-        figures[f"{name}_ratio"] = statistics.median(r[name] / r["lerobot"] for r in found)
-    return figures
+        metrics[f"{name}_ratio"] = statistics.median(r[name] / r["lerobot"] for r in found)
+    return metrics
 
 
 def measure_hub_epoch(folder: Path, episodes: int, length: int, rounds: int) -> dict[str, object]:
@@ -158,7 +158,7 @@ def epoch_rate(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleCon
     """Windows per second of wall clock of an epoch."""
     index = EpisodeIndex.of([reader])
     stream = StreamingSampler(index, config, shuffle=shuffle, checked=not reader.is_remote)
-    batches = int(index.num_frames * shuffle.reuse / config.length / config.batch_size)
+    batches = max(1, int(index.num_frames * shuffle.reuse / config.length / config.batch_size))
     start = time.perf_counter()
     for _ in range(batches):
         next(stream)
@@ -169,10 +169,12 @@ def main() -> None:
     """Measure and print."""
     options = parser(__doc__)
     options.add_argument("--root", type=Path, help="dataset to read instead of a synthetic one")
-    options.add_argument("--episodes", type=int, default=100, help="of the synthetic dataset")
+    options.add_argument(
+        "--episodes", type=int, default=100, help="episodes of the synthetic dataset"
+    )
     options.add_argument("--length", type=int, default=32, help="rows of a window")
-    options.add_argument("--window", type=int, default=128, help="episodes in memory")
-    options.add_argument("--reuse", type=float, default=1.0, help="uses of each row while there")
+    options.add_argument("--shuffle_episodes", type=int, default=128, help="episodes in memory")
+    options.add_argument("--reuse", type=float, default=1.0, help="mean uses of a row in memory")
     options.add_argument(
         "--hub_episodes",
         type=int,
@@ -181,20 +183,20 @@ def main() -> None:
     )
     args = options.parse_args()
     torch.set_num_threads(1)
-    figures: dict[str, object] = {}
+    metrics: dict[str, object] = {}
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         root = args.root or home / "dataset"
         if args.root is None:
             write_dataset(root, [make_episode(i, 150) for i in range(args.episodes)])
         if args.hub_episodes:  # first: measured by wall clock, without other files in memory
-            figures |= measure_hub_epoch(
+            metrics |= measure_hub_epoch(
                 home / "remote", args.hub_episodes, args.length, args.rounds
             )
         index = EpisodeIndex.of([open_dataset(root)], "train")
-        shuffle = ShuffleConfig(args.window, args.reuse)
-        figures |= compare(index, args.length, args.rounds, shuffle)
-        publish(figures, args.json)
+        shuffle = ShuffleConfig(args.shuffle_episodes, args.reuse)
+        metrics |= compare(index, args.length, args.rounds, shuffle)
+        publish(metrics, args.json)
 
 
 if __name__ == "__main__":

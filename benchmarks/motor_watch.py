@@ -1,10 +1,10 @@
-"""False alarms of the motor watch: simulated walking, standing, reaching and pushes.
+"""False alarms of the motor watch: simulated walking, standing with moving hands, and pushes.
 
 Robots of different mass, friction, gains and delay play the skills of `egovcp-eval-lowlevel` with
-sensor noise; pushes come every second, in any horizontal direction. A robot is watched until it
-falls or raises an alarm. An alarm is a false alarm (exit code 1). With --dropped, the left knee's
-motor gives almost no torque from 3 s on, only that of its damping: later alarms are detections.
-Their share of the robots that are watched at 3 s and their delay are measured.
+sensor noise; in push skills, a push every second, in any horizontal direction. A robot is watched
+until it falls or raises an alarm. An alarm is a false alarm (exit code 1). With --dropped, the
+left knee's motor gives almost no torque from 3 s on, only that of its damping: later alarms are
+detections. Their share of the robots that are watched at 3 s and their delay are measured.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _TEMPERATURE = np.full((len(JOINT_NAMES), 1), 40.0)  # deg C, below every limit
 def run_skill(
     controller_name: str, skill: Skill, robots: int, seed: int, dropped: bool
 ) -> tuple[float, list[str], int, list[float]]:
-    """Returns the total time the robots were watched (s), the false alarms, how many robots were
-    watched at the fault, and the times of detections after the fault (s)."""
+    """Play a skill; return the total time the robots were watched (s), the false alarms, how many
+    robots were watched at the fault, and the times of detections after the fault (s)."""
     rng = np.random.default_rng([seed, 1])
     config = DisturbanceConfig()
     physics = BatchPhysics(robots, "stock", config, 1, seed)
@@ -54,18 +54,18 @@ def run_skill(
     watches = [MotorWatch() for _ in range(robots)]
     watched: NDArray[np.bool_] = np.ones(robots, np.bool_)
     seconds, false_alarms, at_fault, detection_times = 0.0, list[str](), 0, list[float]()
-    for tick, command in enumerate(commands):
+    for tick, commands_now in enumerate(commands):
         if skill.push and tick % CONTROLLER_HZ == CONTROLLER_HZ // 2:
             physics.qvel[:, :2] += horizontal(skill.push, rng.uniform(-np.pi, np.pi, robots))
         if tick == _DROPPED_TICK:
             at_fault = int(watched.sum())
-        target = controller.step(measure(snapshot, command, std, rng))
+        target = controller.step(measure(snapshot, commands_now, std, rng))
         sent = target.copy()
         if dropped and tick >= _DROPPED_TICK:
             sent[:, _KNEE] = snapshot.joints[:, _KNEE]  # leaves the damping only
         physics.step(sent, delay)
         snapshot = physics.snapshot()
-        state = measure(snapshot, command, std, rng)
+        state = measure(snapshot, commands_now, std, rng)
         watched &= (
             rotation_matrix(snapshot.quaternion)[:, 2, 2] > np.cos(_FALLEN_TILT)
         ) & ~snapshot.broken
@@ -81,8 +81,8 @@ def run_skill(
                 np.zeros(3),
                 motors=MotorReadings(torque, _TEMPERATURE),
             )
-            motors = MotorCommand(target[i], STIFFNESS, DAMPING)
-            verdict = watches[i].update(reading, motors)
+            command = MotorCommand(target[i], STIFFNESS, DAMPING)
+            verdict = watches[i].update(reading, command)
             seconds += 1.0 / CONTROLLER_HZ
             if reason := verdict.damp or verdict.hold:
                 if dropped and tick >= _DROPPED_TICK:
@@ -119,14 +119,14 @@ def main() -> None:
             at_fault, detection_times = at_fault + watched, detection_times + times
     for line in false_alarms[:20]:
         print(f"false alarm: {line}")
-    figures: dict[str, object] = {"seconds": total, "false_alarms": len(false_alarms)}
+    metrics: dict[str, object] = {"seconds": total, "false_alarms": len(false_alarms)}
     if args.dropped:
-        figures |= {"watched_at_fault": at_fault, "detections": len(detection_times)}
-        figures["detection_rate"] = len(detection_times) / at_fault if at_fault else None
+        metrics |= {"watched_at_fault": at_fault, "detections": len(detection_times)}
+        metrics["detection_rate"] = len(detection_times) / at_fault if at_fault else None
     if detection_times:
         p50, p99 = np.percentile(detection_times, [50, 99])
-        figures |= {"detection_s_p50": p50, "detection_s_p99": p99}
-    publish(figures, args.json)
+        metrics |= {"detection_s_p50": p50, "detection_s_p99": p99}
+    publish(metrics, args.json)
     if false_alarms:
         raise SystemExit(1)
 

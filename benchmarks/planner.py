@@ -1,12 +1,16 @@
 """Milliseconds per plan of every backend, against plain eager PyTorch of the same mathematics.
 
 The plain one follows equation 15: every candidate has a copy of the state, and every step runs
-every network, in float32. All have the same weights and random draws.
+every network, in float32. All have the same weights; those on the CPU have the same random draws.
+All backends on the CPU have the search of `auto`. With fewer than 100 rounds, `p99` is the maximum.
+
+    python benchmarks/planner.py --rounds 100
 
 `arithmetic_share` is a backend's rate, counting only the arithmetic that a plan needs, relative to
 a plain matrix product of the same precision in the same run. `observe` is the filter's step;
-`command` is from an observation to the action, with the backend of `auto`. Where there is a GPU,
-`gpu_*` are plans on it, by CUDA graphs, up to the action in the processor's memory.
+`command` is from an observation to the action, with the backend of `auto`. `gpu_eager` and
+`gpu_float32` are plans on a GPU, if there is one, up to the action in CPU memory; `gpu_float32`
+replays a CUDA graph.
 """
 
 from __future__ import annotations
@@ -58,7 +62,7 @@ def plain_plan(
 
 def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
     """Arithmetic of one plan: multiplications and additions of matrix products, without those that
-    all candidates share at k = 0, the prior's deviation, and what follows the last step."""
+    all candidates share at k = 0, of the prior's standard deviation, and after the last step."""
 
     def macs(*modules: nn.Module) -> int:
         linears = [x for m in modules for x in m.modules()]
@@ -95,7 +99,8 @@ def gpu_plans(
 
     names: tuple[BackendName, ...] = ("eager", "float32")
     return {
-        f"gpu_{name}": planned(make_evaluator(there, PlannerConfig(backend=name))) for name in names
+        f"gpu_{name}": planned(make_evaluator(there, replace(config, backend=name)))
+        for name in names
     }
 
 
@@ -117,7 +122,7 @@ def plain_products() -> dict[str, Callable[[], object]]:
 @torch.no_grad()
 def main() -> None:
     p = parser(__doc__)
-    p.add_argument("--samples", type=int, default=1024, help="M")
+    p.add_argument("--samples", type=int, default=1024, help="candidates per iteration, M")
     args = p.parse_args()
     torch.manual_seed(0)
     model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
@@ -137,7 +142,7 @@ def main() -> None:
         return run
 
     names: tuple[BackendName, ...] = ("auto", "eager", "float32", "int8")
-    plans = {name: planned(make_evaluator(model, PlannerConfig(backend=name))) for name in names}
+    plans = {name: planned(make_evaluator(model, replace(config, backend=name))) for name in names}
 
     def plain() -> Tensor:
         return plain_plan(model, carry, executed, config, 1)
@@ -166,7 +171,7 @@ def main() -> None:
     }
     gflop = needed_gflop(model, config)
     rate = {name: 2e-9 * SIDE**3 / p50[f"product_{name}"] for name in products}
-    figures: dict[str, object] = {
+    metrics: dict[str, object] = {
         "plan_ms": 1e3 * p50["plan_auto"],
         "plan_ms_p99": 1e3 * p99["plan_auto"],
         "plan_plain_eager_ms": 1e3 * p50["plain"],
@@ -177,19 +182,19 @@ def main() -> None:
         if name == "auto":
             continue
         seconds = p50[f"plan_{name}"]
-        figures[f"{name}_ms"] = 1e3 * seconds
-        figures[f"{name}_ms_p99"] = 1e3 * p99[f"plan_{name}"]
-        figures[f"{name}_ratio"] = p50["plain"] / seconds
-        figures[f"{name}_action_difference"] = differences[name]
-        figures[f"{name}_gflops"] = gflop / seconds
+        metrics[f"{name}_ms"] = 1e3 * seconds
+        metrics[f"{name}_ms_p99"] = 1e3 * p99[f"plan_{name}"]
+        metrics[f"{name}_ratio"] = p50["plain"] / seconds
+        metrics[f"{name}_action_difference"] = differences[name]
+        metrics[f"{name}_gflops"] = gflop / seconds
         if name in rate:
-            figures[f"{name}_arithmetic_share"] = gflop / seconds / rate[name]
+            metrics[f"{name}_arithmetic_share"] = gflop / seconds / rate[name]
     for name in products:
-        figures[f"product_{name}_gflops"] = rate[name]
+        metrics[f"product_{name}_gflops"] = rate[name]
     for name in ("observe", "command", *on_gpu):
-        figures[f"{name}_ms"], figures[f"{name}_ms_p99"] = 1e3 * p50[name], 1e3 * p99[name]
+        metrics[f"{name}_ms"], metrics[f"{name}_ms_p99"] = 1e3 * p50[name], 1e3 * p99[name]
     shape = {"samples": config.samples, "horizon": config.horizon, "iterations": config.iterations}
-    publish(figures | shape, args.json)
+    publish(metrics | shape, args.json)
 
 
 if __name__ == "__main__":

@@ -99,18 +99,18 @@ def main() -> None:
     trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
     reference = trial.plans("eager", 1)
     best, spread = trial.plan_value(reference[:, None])[:, 0], trial.spread()
-    figures: dict[str, object] = {"states": len(reference), "samples": args.samples}
+    metrics: dict[str, object] = {"states": len(reference), "samples": args.samples}
     others = {name: trial.plans(name, 1) for name in BACKENDS}
     for name, plans in {**others, "other_draws": trial.plans("eager", 2)}.items():
         moved = (plans[:, 0] - reference[:, 0]).abs().mean(1)
         lost = (best - trial.plan_value(plans[:, None])[:, 0]) / spread
-        figures |= {
+        metrics |= {
             f"{name}_action_moved_mean": float(moved.mean()),
             f"{name}_action_moved_p95": float(moved.quantile(0.95)),
             f"{name}_value_lost_mean": float(lost.mean()),
             f"{name}_value_lost_p95": float(lost.quantile(0.95)),
         }
-    publish(figures, args.json)
+    publish(metrics, args.json)
 
 
 if __name__ == "__main__":

@@ -54,13 +54,13 @@ def parser(
     return p
 
 
-def publish(figures: dict[str, object], path: Path | None) -> None:
+def publish(metrics: dict[str, object], path: Path | None) -> None:
     """Print the metrics, one per line, and write them as JSON where asked."""
-    figures = {**figures, **hardware()}
-    width = max(map(len, figures))
-    for name, value in figures.items():
+    metrics = {**metrics, **hardware()}
+    width = max(map(len, metrics))
+    for name, value in metrics.items():
         shown = f"{value:.4g}" if isinstance(value, float) else value
         print(f"{name:<{width}}  {shown}")
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")

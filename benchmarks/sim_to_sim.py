@@ -30,7 +30,7 @@ from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.trial import play
 
 type Survived = NDArray[np.bool_]
-_MOST_BELOW: Final = 3.0  # percentage points
+_STARRED_BELOW: Final = 3.0  # largest loss without a star, percentage points
 _BATCH: Final = 200  # robots side by side
 _NOT_PLAYED: Final = ("still", "rest")  # robots that nothing disturbs
 
@@ -93,7 +93,7 @@ def row(name: str, values: Sequence[float], signed: bool = True) -> str:
     """A line of the table; a star where a difference is too far below."""
     cells = []
     for value in values:
-        star = "*" if signed and value < -_MOST_BELOW else " "
+        star = "*" if signed and value < -_STARRED_BELOW else " "
         cells.append(f"{f'{value:+.1f}' if signed else f'{value:.1f}':>7}{star}")
     return f"{name:<15}" + "".join(cells)
 
@@ -105,9 +105,9 @@ def main() -> None:
     options.add_argument("--controller", default="walk", help="walk, stance, or a file")
     options.add_argument("--episodes", type=int, default=100, help="robots of each skill")
     options.add_argument("--seed", type=int, default=1000, help="seed of robots and commands")
-    options.add_argument("--threads", type=int, default=0, help="0: one per core")
-    options.add_argument("--skills", nargs="+", choices=tuple(skills), default=tuple(skills))
-    options.add_argument("--variants", nargs="+", choices=tuple(VARIANTS), default=tuple(VARIANTS))
+    options.add_argument("--threads", type=int, default=0, help="physics threads; 0: one per core")
+    for flag, names in (("--skills", tuple(skills)), ("--variants", tuple(VARIANTS))):
+        options.add_argument(flag, nargs="+", choices=names, default=names, help="which to play")
     args = options.parse_args()
     threads = args.threads or available_cores()
 

@@ -164,7 +164,7 @@ def main() -> None:
         peak_rss = max(peak_rss, peak)
         collected.append(collection_rate(config) / cores)
     ratios = [c / b for c, b in zip(collected, bare, strict=True)]
-    figures: dict[str, object] = {
+    metrics: dict[str, object] = {
         "task": args.task,
         "controller": args.controller,
         "simulation_ticks_per_s_core": statistics.median(bare),
@@ -172,7 +172,7 @@ def main() -> None:
         "collection_ticks_per_s_core": statistics.median(collected),
         "collection_ratio": statistics.median(ratios),
     }
-    publish({**figures, **milliseconds_per_tick(config)}, args.json)
+    publish({**metrics, **milliseconds_per_tick(config)}, args.json)
 
 
 if __name__ == "__main__":

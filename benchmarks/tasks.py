@@ -107,7 +107,8 @@ def _play(pool: EpisodePool, groups: Sequence[EpisodeGroup]) -> list[EpisodeScor
 def released(env_config: EnvConfig, episodes: int, seed: int) -> float:
     """Share of the wall's scenarios in which the oracle releases the wall and stays up.
 
-    Both hands must be within `NEUTRAL_M` of their start `RELEASE_S` after the disturbance.
+    Both hands must be within `NEUTRAL_M` of their start, `RELEASE_S` after the wall's
+    `disturbed_time` ends.
     """
     env = VectorEnv(env_config, episodes, render_depth=False)
     env.reset([held_out("wall", seed, i) for i in range(episodes)])
@@ -135,7 +136,7 @@ def normalized_reward(controller: str, found: dict[str, Result]) -> float | None
 
 
 def rows(name: str, found: dict[str, Result]) -> list[str]:
-    """A line per controller."""
+    """Table row of each controller."""
     lines = []
     for controller, r in found.items():
         normalized = normalized_reward(controller, found)
@@ -151,8 +152,8 @@ def rows(name: str, found: dict[str, Result]) -> list[str]:
     return lines
 
 
-def figures(name: str, found: dict[str, Result]) -> dict[str, object]:
-    """Flat keys."""
+def metrics(name: str, found: dict[str, Result]) -> dict[str, object]:
+    """Flat metric name -> value, for `publish`."""
     prefix, out = name.replace(" ", "_").replace("/", "_per_"), dict[str, object]()
     for controller, r in found.items():
         key = f"{prefix}_{controller}"
@@ -173,15 +174,19 @@ def main() -> None:
     options.add_argument("--seed", type=int, default=0, help="seed of the scenarios")
     options.add_argument("--workers", type=int, default=0, help="processes; 0: one per core")
     options.add_argument(
-        "--controllers", nargs="+", choices=CONTROLLERS, default=CONTROLLERS, help="which play"
+        "--controllers",
+        nargs="+",
+        choices=CONTROLLERS,
+        default=CONTROLLERS,
+        help="controllers to play",
     )
-    options.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS, help="which to play")
+    options.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS, help="tasks to play")
     options.add_argument(
         "--pushes",
         type=float,
         nargs="*",
         default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2],
-        help="m/s, push speeds at which the wall is also played",
+        help="push speeds at which the wall is also played, m/s; without values: none",
     )
     args = options.parse_args()
     base = replace(evaluation_config(), controller=args.controller)
@@ -191,7 +196,7 @@ def main() -> None:
         name: str, env: EnvConfig, task: str, controllers: Sequence[str] = args.controllers
     ) -> dict[str, Result]:
         found = measure(env, task, controllers, args.episodes, args.seed, args.workers)
-        published.update(figures(name, found))
+        published.update(metrics(name, found))
         print("\n".join(rows(name, found)), flush=True)
         return found
 
@@ -209,7 +214,8 @@ def main() -> None:
     if "wall" in args.tasks:
         measured("wall default", base, "wall")
         published["wall_released"] = share = released(base, args.episodes, args.seed)
-        print(f"wall: oracle stands with free hands {RELEASE_S:g} s after the push: {share:.0%}")
+        after = base.wall.disturbed_time + RELEASE_S
+        print(f"wall: oracle stands with free hands {after:g} s after the push: {share:.0%}")
     speeds, suitable = args.pushes if "wall" in args.tasks else [], list[str]()
     for speed in speeds:
         wall = replace(base.wall, push_speed_range=(speed, speed), away_probability=0.0)

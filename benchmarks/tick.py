@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from report import parser, publish
-from tick_logging import logging_figures, percentiles
+from tick_logging import logging_metrics, percentiles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
 
@@ -96,7 +96,7 @@ def _loop(hardware: Hardware, checked: bool) -> ControlLoop:
     return loop
 
 
-def control_figures(rounds: int) -> dict[str, object]:
+def control_metrics(rounds: int) -> dict[str, object]:
     """Percentiles of ``rounds`` seconds of each case, which take turns of a second. Changes the
     priority and the switch interval of the process."""
     late: dict[str, list[float]] = {"checked": [], "unchecked": []}
@@ -113,13 +113,13 @@ def control_figures(rounds: int) -> dict[str, object]:
             name = "checked" if checked else "unchecked"
             hardware.body._filter = PlausibilityFilter() if checked else _Unchecked()
             _measure(_loop(hardware, checked), late[name], interval[name])
-    figures: dict[str, object] = {"control_real_time_priority": granted}
+    metrics: dict[str, object] = {"control_real_time_priority": granted}
     for what, values in (("control_tick", late), ("control_interval", interval)):
         for name, times in values.items():
-            figures |= percentiles(f"{what}_{name}", times)
+            metrics |= percentiles(f"{what}_{name}", times)
         ratio = np.percentile(values["checked"], 99) / np.percentile(values["unchecked"], 99)
-        figures[f"{what}_p99_ratio"] = float(ratio)
-    return figures
+        metrics[f"{what}_p99_ratio"] = float(ratio)
+    return metrics
 
 
 def _measure(loop: ControlLoop, late: list[float], interval: list[float]) -> None:
@@ -137,7 +137,7 @@ def _measure(loop: ControlLoop, late: list[float], interval: list[float]) -> Non
         rate.wait()
 
 
-def filter_figures(rounds: int) -> dict[str, object]:
+def filter_metrics(rounds: int) -> dict[str, object]:
     """Percentiles over ``rounds`` seconds of ticks without pauses."""
     torch.set_num_threads(1)
     policy = Policy(WorldModel(WorldModelConfig()), PlannerConfig(), 1)
@@ -176,9 +176,9 @@ def _observation(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 #: Part of a tick -> its metrics, from the number of seconds to measure each case for.
 PARTS: Mapping[str, Callable[[int], dict[str, object]]] = {
-    "control": control_figures,
-    "filter": filter_figures,
-    "logging": logging_figures,
+    "control": control_metrics,
+    "filter": filter_metrics,
+    "logging": logging_metrics,
 }
 
 
@@ -186,11 +186,11 @@ def main() -> None:
     p = parser(__doc__, rounds_help="seconds of each case")
     p.add_argument("--parts", nargs="*", choices=sorted(PARTS), default=sorted(PARTS))
     args = p.parse_args()
-    figures: dict[str, object] = {}
+    metrics: dict[str, object] = {}
     for part in args.parts:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-            figures |= process.submit(PARTS[part], args.rounds).result()
-    publish(figures, args.json)
+            metrics |= process.submit(PARTS[part], args.rounds).result()
+    publish(metrics, args.json)
 
 
 if __name__ == "__main__":

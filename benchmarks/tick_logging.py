@@ -10,7 +10,8 @@ lock, then writes a complete tick to an MCAP file and to Rerun.
     stalled_disk  the same; the process that writes the MCAP file is stopped
     dead_viewer   the same; the Rerun viewer was killed
 
-``cpu`` metrics are the CPU time of the loop's thread while it writes.
+``cpu`` metrics are the CPU time of the loop's thread while it writes. Part of `tick.py`: run
+`python benchmarks/tick.py --parts logging`.
 """
 
 from __future__ import annotations
@@ -78,25 +79,25 @@ class Threaded:
             self._sink.write(tick)
 
 
-def logging_figures(rounds: int) -> dict[str, object]:
+def logging_metrics(rounds: int) -> dict[str, object]:
     """Percentiles of each case over ``rounds`` seconds; differences and ratios to ``none``."""
     torch.set_num_threads(1)
     with contextlib.ExitStack() as stack:
         cases = {name: stack.enter_context(case) for name, case in _cases(stack).items()}
         spent = _measure(cases, rounds)
-    figures: dict[str, object] = {"seconds_per_case": rounds}
+    metrics: dict[str, object] = {"seconds_per_case": rounds}
     for name, times in spent.items():
-        figures |= percentiles(f"tick_{name}", times.tick)
-        figures |= percentiles(f"write_{name}", times.write)
-        figures |= percentiles(f"write_{name}_cpu", times.write_cpu)
+        metrics |= percentiles(f"tick_{name}", times.tick)
+        metrics |= percentiles(f"write_{name}", times.write)
+        metrics |= percentiles(f"write_{name}_cpu", times.write_cpu)
     for name in spent:
         if name != "none":
             base, own = spent["none"].tick, spent[name].tick
             for q in (50, 99):
                 without, with_log = np.percentile(base, q), np.percentile(own, q)
-                figures[f"logging_{name}_added_ms_p{q}"] = float(1e3 * (with_log - without))
-            figures[f"logging_{name}_ratio"] = float(np.median(own) / np.median(base))
-    return figures
+                metrics[f"logging_{name}_added_ms_p{q}"] = float(1e3 * (with_log - without))
+            metrics[f"logging_{name}_ratio"] = float(np.median(own) / np.median(base))
+    return metrics
 
 
 def percentiles(name: str, seconds: list[float]) -> dict[str, object]:

@@ -180,7 +180,7 @@ def timed(step: Callable[[], object]) -> tuple[float, float]:
     return time.process_time() - cpu, time.perf_counter() - clock
 
 
-def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
+def metrics(turns: list[Times], name: str, frames: int) -> dict[str, object]:
     """Metrics of one case; keys begin with ``name``."""
 
     def ratio(a: str, b: str, of: int = 0) -> float:
@@ -214,7 +214,7 @@ def measure(
         for count in threads:
             turns, difference = take_turns(root, returns, size, count, rounds)
             name = f"step_{size}_threads_{count}"
-            out |= figures(turns, name, size * LENGTH)
+            out |= metrics(turns, name, size * LENGTH)
             out[f"{name}_loss_difference"] = difference
     return out
 

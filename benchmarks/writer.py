@@ -103,12 +103,12 @@ def main() -> None:
     found = [
         [rate(w, episodes) for w in (lerobot, write_dataset, service)] for _ in range(args.rounds)
     ]
-    figures = {}
+    metrics = {}
     for i, name in enumerate(("lerobot", "writer", "service")):
-        figures[f"{name}_frames_per_s"] = statistics.median(row[i] for row in found)
+        metrics[f"{name}_frames_per_s"] = statistics.median(row[i] for row in found)
         if i:
-            figures[f"{name}_ratio"] = statistics.median(row[i] / row[0] for row in found)
-    publish(figures, args.json)
+            metrics[f"{name}_ratio"] = statistics.median(row[i] / row[0] for row in found)
+    publish(metrics, args.json)
 
 
 if __name__ == "__main__":

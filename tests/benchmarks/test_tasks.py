@@ -45,8 +45,8 @@ def test_rows_are_narrow_and_name_the_best_constant_action():
     assert len(lines) == 4
     assert max(map(len, lines)) <= 120
     assert lines[-1].endswith("50%  0.45 -0.3 0.85 0.45 0.3 0.85 0")
-    figures = tasks.figures("wall 0.85 m/s", found)
-    assert figures["wall_0.85_m_per_s_constant_normalized_reward"] == pytest.approx(0.5)
+    metrics = tasks.metrics("wall 0.85 m/s", found)
+    assert metrics["wall_0.85_m_per_s_constant_normalized_reward"] == pytest.approx(0.5)
 
 
 def test_all_controllers_play_a_task(monkeypatch: pytest.MonkeyPatch):

@@ -28,11 +28,11 @@ def test_the_plain_step_has_the_same_loss(seed: int) -> None:
 
 @pytest.mark.slow
 def test_a_given_dataset_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root, out = tmp_path / "dataset", tmp_path / "figures.json"
+    root, out = tmp_path / "dataset", tmp_path / "metrics.json"
     write_dataset(root, [make_episode(i, 40) for i in range(3)])
     flags = f"--root {root} --json {out} --batches 2 --threads 1 --rounds 1"
     monkeypatch.setattr("sys.argv", ["train_step.py", *flags.split()])
     train_step.main()
-    figures = json.loads(out.read_text())
-    assert figures["step_2_threads_1_ratio"] > 0
-    assert figures["step_2_threads_1_loss_difference"] <= train_step.TOLERANCE
+    metrics = json.loads(out.read_text())
+    assert metrics["step_2_threads_1_ratio"] > 0
+    assert metrics["step_2_threads_1_loss_difference"] <= train_step.TOLERANCE
