@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from egovcp.sim.config import EnvConfig
     from egovcp.sim.policies import EnvPolicy
 
-CHECK_SEED: Final = 6_000_000_000  # scenarios of no collection and no evaluation
 _ENV_TICKS: Final = 10
 
 
@@ -31,7 +31,7 @@ class TaskReport:
     reward: dict[str, dict[str, float]]
     """Controller -> reward term -> mean sum per episode."""
     ms_per_step: float
-    """Simulation with depth image, ms per robot and planner step of 40 ms."""
+    """Wall-clock time per robot and planner step, with depth image and checks, ms."""
 
 
 def check_task(
@@ -39,14 +39,14 @@ def check_task(
 ) -> TaskReport:
     """Play episodes of a task under hold, random actions and the oracle, and check every step.
 
-    Seeds reproduce episodes bit for bit, also after other episodes and in another row. Rewards are
-    finite, bounded by ``MAX_REWARD``, and the sum of their terms. Only a fall or the time limit
-    ends an episode, success does not.
+    Seeds must reproduce episodes bit for bit, also after other episodes and in another row. States
+    and rewards must be finite, and reward terms at most ``MAX_REWARD`` in size. An episode ends by
+    a fall or the time limit, never by success. `check_env` checks the first 10 ticks only.
 
     Args:
         task: name of an installed task, or ``package.module:Class``.
         episodes: scenarios of each controller.
-        seed: which ones.
+        seed: from 0, selects the scenarios.
         config: the environment; None: the defaults with an event in every episode.
 
     Raises:
@@ -57,26 +57,25 @@ def check_task(
     from egovcp.sim.config import evaluation_config
     from egovcp.sim.policies import Hold, Oracle, RandomWalk
     from egovcp.sim.robot_env import make_env
-    from egovcp.sim.scenario import Scenario
+    from egovcp.sim.scenario import CHECK_SEED, Scenario
     from egovcp.sim.tasks.registry import find_task, register_task
 
     name = register_task(task) if ":" in task else task
     kind = find_task(name)
-    env = make_env(config or evaluation_config(), episodes, [name])
     scenarios = [Scenario(name, CHECK_SEED + seed, i) for i in range(episodes)]
-    check_env(env, scenarios, _ENV_TICKS)
-    started = time.perf_counter()
-    played = {"random": _play(env, RandomWalk(), scenarios)}
-    steps = sum(len(episode.arrays["reward"]) for episode in played["random"])
-    ms = 1e3 * (time.perf_counter() - started) / steps
-    again = _play(env, RandomWalk(), scenarios[::-1])
-    for a, b in zip(played["random"], again[::-1], strict=True):
-        _require_equal(name, a, b)
-    played["hold"] = _play(env, Hold(), scenarios)
-    if kind.has_oracle():
-        played["oracle"] = _play(env, Oracle(), scenarios)
-    terms = env.instances[0].task.reward_terms
-    env.close()
+    with closing(make_env(config or evaluation_config(), episodes, [name])) as env:
+        check_env(env, scenarios, _ENV_TICKS)
+        started = time.perf_counter()
+        played = {"random": _play(env, RandomWalk(), scenarios)}
+        steps = sum(len(episode.arrays["reward"]) for episode in played["random"])
+        ms = 1e3 * (time.perf_counter() - started) / steps
+        again = _play(env, RandomWalk(), scenarios[::-1])
+        for a, b in zip(played["random"], again[::-1], strict=True):
+            _require_equal(name, a, b)
+        played["hold"] = _play(env, Hold(), scenarios)
+        if kind.has_oracle():
+            played["oracle"] = _play(env, Oracle(), scenarios)
+        terms = env.instances[0].task.reward_terms
     arrays = {n: [episode.arrays for episode in each] for n, each in played.items()}
     return TaskReport(
         task=name,
@@ -143,6 +142,7 @@ def _check(instance: Any, row: int, result: Any) -> None:
                 f"task {scenario.task}, episode {scenario.episode}, {task.time:.2f} s: {problem}"
             )
 
+    require(np.isfinite(result.observation.state[row]).all(), "its state is not finite")
     for name, value in instance.parameters.items():
         require(np.isfinite(value), f"its parameter {name} is {value}")
     for name, values in result.reward_terms.items():
@@ -160,7 +160,8 @@ def _check(instance: Any, row: int, result: Any) -> None:
 
 
 def _has_fallen(task: Any) -> bool:
-    """Whether the robot of a task fell; of another robot than the G1 what its task says."""
+    """Whether the robot fell: for the G1 by `Task.has_fallen` even if the task overrides it, else
+    by the task's own `has_fallen`."""
     from egovcp.sim.tasks.base import Task
 
     return Task.has_fallen(task) if isinstance(task, Task) else bool(task.has_fallen())
@@ -168,7 +169,10 @@ def _has_fallen(task: Any) -> bool:
 
 def _require_equal(task: str, a: _Episode, b: _Episode) -> None:
     if a.parameters != b.parameters:
-        raise ConformanceError(f"task {task}, episode {a.number}: a second run draws others")
+        raise ConformanceError(
+            f"task {task}, episode {a.number}: its parameters differ in a second run; draw them "
+            "with sample and scenario.rng"
+        )
     for name, values in a.arrays.items():
         other = b.arrays[name]
         same = len(values) == len(other) and np.array_equal(values, other)

@@ -61,7 +61,7 @@ COS_ROTATION: Final[Array] = SIN_ROTATION @ _cross_matrices(JOINT_AXIS)
 #: below and above, left side; roll and yaw of the right side are mirrored. A servo's torque is
 #: proportional to target minus position, so a loaded joint near its stop needs a target beyond it:
 #: 0.6 rad for an ankle to hold 17 N m with 29 N m/rad. Comments: the greatest excess measured with
-#: ``benchmarks/joint_targets.py`` over all tasks and both controllers, which clip at 0.6.
+#: ``benchmarks/joint_targets.py`` over all tasks and controllers, which clip at 0.6.
 _SLACK: Final[dict[str, tuple[float, float]]] = {
     "hip_pitch": (0.6, 0.1),  # 0.58, -
     "hip_roll": (0.4, 0.1),  # 0.25, -

@@ -65,7 +65,7 @@ class RandomWalk(EnvPolicy):
     Args:
         eta: largest change of an action per step; the environment sends a step beyond its rate
             limit as a ramp.
-        bounds: ``reflect`` folds actions outside the box back inside, which keeps their
+        boundary: ``reflect`` folds actions outside the box back inside, which keeps their
             distribution uniform; ``clip`` accumulates them on its walls.
         step_ticks: least and most ticks from one step to the next, sampled for each step.
     """
@@ -73,11 +73,11 @@ class RandomWalk(EnvPolicy):
     def __init__(
         self,
         eta: float = ACTION_ETA,
-        bounds: Literal["reflect", "clip"] = "reflect",
+        boundary: Literal["reflect", "clip"] = "reflect",
         step_ticks: tuple[int, int] = (1, 1),
     ) -> None:
         self._eta = eta
-        self._bounds = bounds
+        self._boundary = boundary
         self._step_ticks = step_ticks
         self._action: Array = np.zeros((0, ACTION_DIM))
         self._wait = np.zeros(0, dtype=np.int64)  # ticks until the next step
@@ -121,7 +121,7 @@ class RandomWalk(EnvPolicy):
     def act(self, env: BaseVectorEnv) -> Array:
         delta = np.array([self._delta(row) for row in range(len(self._rngs))])
         action = self._action + self._eta * delta
-        reflects = self._bounds == "reflect"
+        reflects = self._boundary == "reflect"
         self._action[:] = reflect(action) if reflects else np.clip(action, -1.0, 1.0)
         return self._action.copy()
 

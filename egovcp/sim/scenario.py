@@ -17,6 +17,7 @@ HELD_OUT: Final = 1_000_000_000  # evaluation and deployment
 SEARCH: Final = 2_000_000_000  # for the best constant action
 VALIDATION: Final = 3_000_000_000  # during training
 STUDIES: Final = 4_000_000_000  # of egovcp-experiment
+CHECK_SEED: Final = 6_000_000_000  # for `check_task`
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from egovcp.spec import (
     CONTROLLER_TICKS_PER_PLAN,
     PHYSICS_DT,
     PHYSICS_STEPS_PER_CONTROLLER_TICK,
+    Solid,
 )
 
 if TYPE_CHECKING:
@@ -87,6 +88,10 @@ class Task(BaseTask):
         """Ids of the geoms of `add_objects`."""
         return tuple(self.robot.index.objects[self.name])
 
+    def solids(self) -> tuple[Solid, ...]:
+        """Objects in the scene besides robot and floor: by default all geoms of `add_objects`."""
+        return tuple(self._solid(geom) for geom in self.object_geoms())
+
     def to_heading_frame(self, vector_w: Array) -> Array:
         """(3,) world vector in the axes of the pelvis heading frame."""
         vector: Array = np.einsum("i,ij->j", vector_w, self.robot.heading)
@@ -120,9 +125,9 @@ class Task(BaseTask):
     def step(self) -> None:
         """Act on the scene, do one physics step and process its contacts."""
         self.before_step()
-        self.after_step(self.robot.step())
+        self.record_contacts(self.robot.step())
 
-    def after_step(self, contacts: Sequence[Contact]) -> None:
+    def record_contacts(self, contacts: Sequence[Contact]) -> None:
         """Count a physics step and process its contacts."""
         self.physics_steps += 1
         for contact in contacts:

@@ -96,8 +96,8 @@ class BaseTask(ABC):
     def add_objects(cls, spec: mujoco.MjSpec) -> None:
         """Add the task's bodies to the scene, out of sight; called once per process.
 
-        A geom meets the robot if its ``contype`` is 1. Shapes that vary between episodes are set in
-        ``__init__`` with `SimulatedRobot.shape_geom`.
+        A geom collides with the robot if its ``contype`` is 1. Shapes that vary between episodes
+        are set in ``__init__`` with `SimulatedRobot.shape_geom`.
         """
 
     @abstractmethod
@@ -138,12 +138,8 @@ class BaseTask(ABC):
         return False
 
     @abstractmethod
-    def object_geoms(self) -> tuple[int, ...]:
-        """Ids of the geoms of `add_objects`."""
-
     def solids(self) -> tuple[Solid, ...]:
-        """Objects in the scene besides robot and floor: by default all geoms of `add_objects`."""
-        return tuple(self._solid(geom) for geom in self.object_geoms())
+        """Shapes in the scene that recordings show."""
 
     # --- what a task may use -------------------------------------------------------------
     def sample(self, *names: str) -> dict[str, float]:

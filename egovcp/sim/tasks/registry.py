@@ -181,6 +181,12 @@ def register_task(reference: str) -> str:
     return entry.name
 
 
+def installed_task(name: str) -> type[BaseTask] | None:
+    """The usable task of this name; None if there is none."""
+    tasks = (entry.task for entry in task_entries() if entry.name == name)
+    return next((task for task in tasks if task is not None), None)
+
+
 def find_task(name: str, option: str = "") -> type[BaseTask]:
     """The task of this name; ``option`` is named in the error.
 
@@ -188,10 +194,10 @@ def find_task(name: str, option: str = "") -> type[BaseTask]:
         UsageError: no task has this name.
         EnvironmentFailure: its plugin is defective.
     """
+    found = installed_task(name)
+    if found is not None:
+        return found
     entries = task_entries()
-    for entry in entries:
-        if entry.name == name and entry.task is not None:
-            return entry.task
     for entry in entries:
         if entry.name == name:
             raise EnvironmentFailure(entry.failure)
@@ -235,5 +241,5 @@ def seed_key(name: str) -> int:
 
 def describe_task(name: str) -> str:
     """`Task.description`; empty for a task that is not installed."""
-    tasks = [entry.task for entry in task_entries() if entry.name == name and entry.task]
-    return tasks[0].description if tasks else ""
+    task = installed_task(name)
+    return task.description if task else ""

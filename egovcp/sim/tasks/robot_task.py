@@ -17,6 +17,7 @@ from egovcp.spec import Solid
 
 _CONSTANTS: Final = (-0.7, 0.0, 0.7)
 _GRID_ACTIONS: Final = 4  # more would make the grid of constant actions too large
+_PLANE: Final = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 class RobotTask(BaseTask):
@@ -46,17 +47,18 @@ class RobotTask(BaseTask):
 
     @classmethod
     def constant_actions(cls) -> list[tuple[float, ...]]:
-        """A grid of three values of every action, or with many of them of one at a time."""
+        """All combinations of -0.7, 0 and 0.7 for up to 4 actions, without the neutral one; with
+        more, one action at a time."""
         count = cls.robot_spec().action_dim
         if count <= _GRID_ACTIONS:
-            return list(itertools.product(_CONSTANTS, repeat=count))
+            return [a for a in itertools.product(_CONSTANTS, repeat=count) if any(a)]
         rows = [value * row for row in np.eye(count) for value in _CONSTANTS if value]
         return [tuple(row.tolist()) for row in rows]
 
     @classmethod
     @cache
     def scene(cls) -> mujoco.MjModel:
-        """The model of robot and objects, compiled once.
+        """The model of robot and objects, compiled once and shared: each episode gets a copy.
 
         Raises:
             EnvironmentFailure: it does not compile, or does not fit the robot's description.
@@ -73,7 +75,7 @@ class RobotTask(BaseTask):
         return model
 
     def after_step(self) -> None:
-        """Look at the scene after a physics step, such as for contacts."""
+        """Called after each physics step, e.g. to read contacts; does nothing by default."""
 
     def step(self) -> None:
         """Act on the scene and do one physics step."""
@@ -86,16 +88,10 @@ class RobotTask(BaseTask):
         """Whether the episode has failed, which ends it; by default never."""
         return False
 
-    def object_geoms(self) -> tuple[int, ...]:
-        """Ids of the geoms of `add_objects`."""
-        return _object_geoms(type(self))
-
     def solids(self) -> tuple[Solid, ...]:
-        """The objects, and the links of the robot; without planes."""
-        model = self.robot.model
-        links = [i for i in range(model.ngeom) if i not in self.object_geoms()]
-        planes = {i for i in links if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_PLANE}
-        return super().solids() + tuple(self._solid(i) for i in links if i not in planes)
+        """All geoms that are not planes: links of the robot, and objects."""
+        kinds = self.robot.model.geom_type
+        return tuple(self._solid(int(i)) for i in np.flatnonzero(kinds != _PLANE))
 
     @property
     def object_b(self) -> Array:
@@ -105,12 +101,3 @@ class RobotTask(BaseTask):
         mujoco.mju_quat2Mat(rotation, pose[3:])
         position: Array = (self.object_w - pose[:3]) @ rotation.reshape(3, 3)
         return position
-
-
-@cache
-def _object_geoms(cls: type[RobotTask]) -> tuple[int, ...]:
-    known = cls.robot_class.build().compile()
-    names = {known.body(i).name for i in range(known.nbody)}
-    model = cls.scene()
-    new = [i for i in range(model.nbody) if model.body(i).name not in names]
-    return tuple(g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in new)

@@ -176,7 +176,7 @@ class SequenceTask(Task):
         self._part.before_step()
 
     def process_contacts(self, contacts: Sequence[Contact]) -> None:
-        self._part.after_step(contacts)
+        self._part.record_contacts(contacts)
 
     def rewards(self) -> dict[str, float]:
         return dict.fromkeys(self._terms, 0.0) | self._part.rewards()
