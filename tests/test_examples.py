@@ -83,6 +83,15 @@ def test_another_robot_conforms(monkeypatch: pytest.MonkeyPatch) -> None:
         check_robot("arm_robot:Nothing")
 
 
+def test_constant_actions_of_another_robot_exclude_the_neutral_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(_ARM))
+    actions = importlib.import_module("arm_task").ReachTask.constant_actions()
+    assert len(set(actions)) == len(actions) == 3**3 - 1
+    assert all(any(action) for action in actions)
+
+
 @pytest.mark.parametrize("damped", [False, True])
 def test_a_damped_robot_no_longer_follows(damped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(_ARM))

@@ -26,11 +26,11 @@ from tests.support.limited import LimitedResult, run_limited
 
 from .listing import ListedCommand, all_commands
 
-SECONDS = 30.0  # on a busy machine; what hangs takes for ever
+SECONDS = 30.0  # limit for all values of a command
 STANCE = "--env.controller=stance"
 #: Before and after the output of a command.
 _BEGIN, _END = "=== begin\n", "=== end "
-#: ListedCommand -> (its arguments, options that name an input, options that name an output).
+#: `ListedCommand.prog` -> (its arguments, options that name an input, options that name an output).
 CASES = {
     "egovcp-collect": (
         f"--dataset.root=NEW --episodes=1 --num_workers=1 {STANCE}",
@@ -144,7 +144,7 @@ INPUTS = (
     *("absent", "fifo", "dangling", "loop", "empty", "folder", "empty/below", "/dev/null"),
     *("x" * 300, "y/" * 3000, "\x1b[31m", "\udcff", "~nobody/x", "", "recording.mcap"),
 )
-#: A recording, a config file without options, no records, and what has the form of a Hub id.
+#: (option, value) pairs that are valid, and therefore left out.
 VALID = {
     *(("file", "recording.mcap"), ("files", "recording.mcap"), ("config_path", "empty")),
     *(("records", ""), ("train.policies", "empty/below"), ("robot.recordings", "recording.mcap")),
@@ -188,8 +188,8 @@ type BadFlags = list[tuple[str, str]]
 def _cases() -> Iterator[tuple[str, str, BadFlags]]:
     """(program, its arguments, flags with bad paths).
 
-    The first command with an option is given every value; the others, which read the option with
-    the same code, a share of them, each another one.
+    The first command with an option gets all values; later ones, which share the parsing code, get
+    a rotating quarter (inputs) or third (outputs).
     """
     commands = Counter[tuple[str, tuple[str, ...]]]()
     for prog, arguments, inputs, outputs in [*((p, *case) for p, case in CASES.items()), *MORE]:

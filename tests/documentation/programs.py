@@ -1,4 +1,4 @@
-"""Parse a command line with the real parser of its program, and go no further."""
+"""Checks a command line with its program's parser, without running the program."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LEROBOT_CONFIGS = {
     "lerobot-rollout": "lerobot.rollout:RolloutConfig",
     "lerobot-train": "lerobot.configs.train:TrainPipelineConfig",
 }
-#: Packages of others that are installed by name.
+#: Third-party packages in documented `pip install` commands.
 _PACKAGES = {"trackio", "uv", "wandb"}
 
 
@@ -48,6 +48,8 @@ def check(argv: Sequence[str]) -> None:
     program, *args = argv
     if not args and program not in ("make", "pip", "python"):
         main_of(program)
+    elif not args:
+        raise WrongCommand(f"{program}: no argument")
     elif program == "make":
         _require(args[0] in _makefile_targets(), f"make has no target {args[0]}")
     elif program == "pip":
@@ -74,7 +76,7 @@ def main_of(program: str) -> Callable[..., int]:
 
 @cache
 def known_flags() -> frozenset[str]:
-    """Every flag of our commands, of our plugins in LeRobot's commands, and of the benchmarks."""
+    """Flags of our commands, of our plugins in LeRobot's commands, of benchmarks and studies."""
     found: set[str] = set()
     for point in metadata.entry_points(group="console_scripts"):
         if point.name.startswith("egovcp-"):
@@ -85,7 +87,6 @@ def known_flags() -> frozenset[str]:
     for script in (ROOT / "benchmarks").glob("*.py"):
         text = script.read_text(encoding="utf-8")
         found |= set(re.findall(r'"(--[\w.-]+)"', text))
-        found |= {f"--{name}" for name in re.findall(r"^    (\w+): [^=\n]+ = ", text, re.M)}
     for study in (ROOT / "experiment/egovcp_experiment/studies").glob("[a-z]*.py"):
         module = import_module(f"egovcp_experiment.studies.{study.stem}")
         if hasattr(module, "measure"):

@@ -41,7 +41,7 @@ def test_a_graph_is_reused_for_equal_shapes_only() -> None:
             found, expected = recorded(*given), _function(*given)
             torch.testing.assert_close(found.sum, expected.sum)
             torch.testing.assert_close(found.parts[0], expected.parts[0])
-    assert recorder.made == 3
+    assert recorder.captures == 3
 
 
 def test_inputs_and_earlier_results_do_not_change() -> None:
@@ -87,7 +87,7 @@ def test_shapes_beyond_the_limit_are_computed_without_a_graph() -> None:
     for size in range(1, MAX_GRAPHS + 4):
         given = _arguments(size, size)
         assert recorded(*given).sum.equal(_function(*given).sum)
-    assert recorder.made == MAX_GRAPHS
+    assert recorder.captures == MAX_GRAPHS
 
 
 def test_other_arguments_are_part_of_the_key() -> None:
@@ -101,7 +101,7 @@ def test_other_arguments_are_part_of_the_key() -> None:
         name, found = recorded(x, by)
         assert name == f"by {by}"
         assert found.equal(by * x)
-    assert recorder.made == 2
+    assert recorder.captures == 2
 
 
 def test_uncopied_results_are_overwritten_by_the_next_call() -> None:

@@ -1,6 +1,8 @@
-"""Cached files are read back only if nobody else can have written them and the digest fits."""
+"""Cached files are read back only if no other user can have written them and their SHA-256
+matches."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,29 +46,34 @@ def _give_away(file: Path) -> None:
     os.chown(file, OTHER_USER, OTHER_USER)
 
 
-DAMAGE = [
-    lambda file: file.write_bytes(b""),
-    lambda file: os.truncate(file, 5000),
-    _flip_a_bit,
-    _link_elsewhere,
-    _replace_by_fifo,
-    lambda file: file.chmod(0o620),
-    lambda file: file.chmod(0o602),
-    lambda file: Path(f"{file}.sha256").unlink(),
-    lambda file: Path(f"{file}.sha256").write_text(f"{'0' * 64}  {NAME}\n"),
-    pytest.param(_give_away, marks=needs_root),
-    pytest.param(lambda file: _give_away(Path(f"{file}.sha256")), marks=needs_root),
-]
-DAMAGE_NAMES = [
-    *("empty", "truncated", "one bit", "symbolic link", "FIFO", "group-writable"),
-    *("world-writable", "no digest", "wrong digest", "file of another", "digest of another"),
-]
+def _digest(file: Path) -> Path:
+    return Path(f"{file}.sha256")
 
 
-@pytest.mark.parametrize("damage", DAMAGE, ids=DAMAGE_NAMES)
-def test_a_damaged_file_is_not_read_and_can_be_replaced(damage: object, folder: Path) -> None:
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda file: file.write_bytes(b""), id="empty"),
+        pytest.param(lambda file: os.truncate(file, 5000), id="truncated"),
+        pytest.param(_flip_a_bit, id="one bit"),
+        pytest.param(_link_elsewhere, id="symbolic link"),
+        pytest.param(_replace_by_fifo, id="FIFO"),
+        pytest.param(lambda file: file.chmod(0o620), id="group-writable"),
+        pytest.param(lambda file: file.chmod(0o602), id="world-writable"),
+        pytest.param(lambda file: _digest(file).unlink(), id="no digest"),
+        pytest.param(
+            lambda file: _digest(file).write_text(f"{'0' * 64}  {NAME}\n"), id="wrong digest"
+        ),
+        pytest.param(_give_away, id="file of another user", marks=needs_root),
+        pytest.param(
+            lambda file: _give_away(_digest(file)), id="digest of another user", marks=needs_root
+        ),
+    ],
+)
+def test_a_damaged_file_is_not_read_and_can_be_replaced(
+    damage: Callable[[Path], object], folder: Path
+) -> None:
     assert _read(folder) == CONTENT
-    assert callable(damage)
     damage(folder / NAME)
     assert _read(folder) is None
     TrustedCache(folder).write(NAME, CONTENT)

@@ -14,8 +14,8 @@ def made(success: np.ndarray, reward: np.ndarray | None = None) -> EvalScores:
     return EvalScores(rewards.astype(float), np.full(rewards.shape, 10.0), success.astype(float))
 
 
-def test_the_same_luck_on_the_same_scenarios_cancels() -> None:
-    """Scenarios differ ten times more than the two: only the paired interval excludes 0."""
+def test_paired_intervals_exclude_scenario_noise() -> None:
+    """The std over scenarios is ten times the difference of the controllers."""
     rng = np.random.default_rng(0)
     noise = rng.normal(0.0, 1.0, (1, 100))
     ours, theirs = made(noise > 9, noise + 0.1), made(noise > 9, noise)

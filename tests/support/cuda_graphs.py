@@ -15,14 +15,14 @@ class RecomputingCapture:
     ones."""
 
     def __init__(self) -> None:
-        self.made = 0
-        """Number of recordings."""
+        self.captures = 0
+        """Number of calls, each of which would record a graph."""
 
     def __call__(
         self, function: Callable[[], Any], device: torch.device
     ) -> tuple[Callable[[], object], Any]:
         """See `egovcp.cuda_graphs.Capture`."""
-        self.made += 1
+        self.captures += 1
         results = function()
 
         def replay() -> None:

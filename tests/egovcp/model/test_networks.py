@@ -25,7 +25,7 @@ def test_split_linear_is_initialised_by_the_number_of_all_inputs():
         assert float(weight.std()) == pytest.approx(1 / 3 / 3**0.5, rel=0.1)
 
 
-def test_mlp_that_starts_at_zero_answers_zero():
+def test_start_at_zero_makes_all_outputs_zero():
     mlp = SplitMlp((7, 2), 16, 3, hidden_layers=2)
     inputs = torch.randn(4, 7), torch.randn(4, 2)
     assert mlp(*inputs).any()

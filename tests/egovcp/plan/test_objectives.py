@@ -15,7 +15,7 @@ from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.plan import PlannerConfig, Policy, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import make_evaluator
-from egovcp.plan.config import TerminationRule, require_compatible
+from egovcp.plan.config import require_compatible
 from egovcp.plan.objective import evaluate
 from egovcp.testing import toy_model
 from tests.support.worlds import Point, PointWorld, ScriptedWorld, plain_planner
@@ -25,14 +25,15 @@ RULES = ("paper", "shift", "survival")
 DEBUG = PRESETS["debug"]
 EARNING = dataclasses.replace(DEBUG, loss=dataclasses.replace(DEBUG.loss, reward=1.0))
 REWARDS, VALUES = [1.0, 2.0, 4.0, 8.0], [5.0, 6.0, 7.0, 9.0]
+MIXED_VALUES = [8.0, 4.0, -2.0, 6.0]
 ALIVE = [0.0, 0.0, 0.0, 0.0]
 
 
-def _scripted(deaths: list[float], gamma: float, floor: float = -10.0) -> ScriptedWorld:
-    return ScriptedWorld(VALUES, deaths, floor, REWARDS, gamma)
-
-
-def _worth(world: ScriptedWorld, horizon: int, **config: Any) -> float:
+def _value(
+    deaths: list[float], horizon: int = 4, values: list[float] = VALUES, **config: Any
+) -> float:
+    """J of a plan in the scripted world, with gamma 0.5 and a smallest return of -10."""
+    world = ScriptedWorld(values, deaths, -10.0, REWARDS, 0.5)
     planner = plain_planner(horizon=horizon, **config)
     actions = torch.zeros(1, 1, planner.actions, spec.ACTION_DIM)
     return evaluate(world, world.start(), actions, planner).item()
@@ -51,8 +52,7 @@ def _worth(world: ScriptedWorld, horizon: int, **config: Any) -> float:
 def test_rewards_are_discounted_and_the_value_comes_after_the_last(
     objective: str, horizon: int, expected: float
 ) -> None:
-    worth = _worth(_scripted(ALIVE, 0.5), horizon, objective=objective)
-    assert worth == pytest.approx(expected)
+    assert _value(ALIVE, horizon, objective=objective) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -65,14 +65,58 @@ def test_rewards_are_discounted_and_the_value_comes_after_the_last(
 )
 def test_a_failed_plan_has_the_value_of_failing_forever(rule: str, expected: float) -> None:
     """It fails at step 1, whose own reward counts; rewards and value after it do not."""
-    world = _scripted([0.0, 1.0, 0.0, 0.0], 0.5)
-    assert _worth(world, 3, objective="td", termination_rule=rule) == pytest.approx(expected)
+    found = _value([0.0, 1.0, 0.0, 0.0], 3, objective="td", termination_rule=rule)
+    assert found == pytest.approx(expected)
 
 
 def test_half_a_failure_costs_half_of_what_comes_next() -> None:
-    world = _scripted([0.0, 0.5, 0.0, 0.0], 0.5)
-    worth = _worth(world, 2, objective="td", termination_rule="survival")
-    assert worth == pytest.approx(1.0 + 0.5 * 2.0 + 0.25 * (0.5 * 7.0 + 0.5 * -10.0))
+    found = _value([0.0, 0.5, 0.0, 0.0], 2, objective="td", termination_rule="survival")
+    assert found == pytest.approx(1.0 + 0.5 * 2.0 + 0.25 * (0.5 * 7.0 + 0.5 * -10.0))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_without_a_failure_the_objective_is_the_mean_value(rule: str) -> None:
+    found = _value(ALIVE, values=MIXED_VALUES, termination_rule=rule)
+    assert found == pytest.approx(sum(MIXED_VALUES) / 4)
+
+
+@pytest.mark.parametrize(
+    ("rule", "deaths", "expected"),
+    [
+        # The failed state's own value counts, later ones are lost.
+        ("paper", [0, 0.95, 0, 0], (8 + 4 + 0 + 0) / 4),
+        ("paper", [0, 0, 0.95, 0], (8 + 4 - 2 + 0) / 4),
+        ("shift", [0, 0.95, 0, 0], (8 + 4 - 10 - 10) / 4),
+        ("shift", [0, 0, 0.95, 0], (8 + 4 - 2 - 10) / 4),
+        # Each value above the floor, weighted with the probability of being alive.
+        ("survival", [0, 0.5, 0, 0], (8 + 4 + (0.5 * 8 - 10) + (0.5 * 16 - 10)) / 4),
+        ("survival", [0, 0.5, 0.5, 0], (8 + 4 + (0.5 * 8 - 10) + (0.25 * 16 - 10)) / 4),
+        ("survival", [0, 1.0, 0, 0], (8 + 4 - 10 - 10) / 4),
+        # At the threshold is not beyond it.
+        ("paper", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
+        ("shift", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
+        # The observed state is alive, whatever D says; after the last step nothing follows.
+        ("paper", [1.0, 0, 0, 0], sum(MIXED_VALUES) / 4),
+        ("survival", [1.0, 0, 0, 1.0], sum(MIXED_VALUES) / 4),
+        # Dead stays dead.
+        ("paper", [0, 0.95, 0.0, 0.0], (8 + 4) / 4),
+    ],
+)
+def test_the_objective_after_a_failure(rule: str, deaths: list[float], expected: float) -> None:
+    found = _value(deaths, values=MIXED_VALUES, termination_rule=rule)
+    assert found == pytest.approx(expected)
+
+
+def test_only_the_papers_rule_rewards_falling_when_values_are_negative() -> None:
+    values, dead = [-1.0, -1.0, -5.0, -5.0], [0.0, 1.0, 0.0, 0.0]
+    gain = {
+        rule: _value(dead, values=values, termination_rule=rule)
+        - _value(ALIVE, values=values, termination_rule=rule)
+        for rule in RULES
+    }
+    assert gain["paper"] > 0
+    assert gain["shift"] < 0
+    assert gain["survival"] < 0
 
 
 # --- against a loop ------------------------------------------------------------------------
@@ -105,11 +149,11 @@ def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfi
     for k in range(ends + 1):
         action = plan[k : k + 1]
         if k == n or config.objective == "value":
-            worth, worst = float(model.value(carry, action)), floor
+            value, worst = float(model.value(carry, action)), floor
         else:
-            worth, worst = float(model.reward(carry, action)), (1 - gamma) * floor
+            value, worst = float(model.reward(carry, action)), (1 - gamma) * floor
         weight = 1 / n if config.objective == "value" else gamma**k
-        total += weight * (share * worth + (1 - share) * worst)
+        total += weight * (share * value + (1 - share) * worst)
         dead = float(model.termination(carry))
         if 0 < k < ends:
             share *= 1 - dead if config.termination_rule == "survival" else float(dead <= 0.5)
@@ -136,7 +180,7 @@ def test_batched_plan_values_equal_single_ones(objective: Any, horizon: int, rul
 
 
 def test_reference_loop_covers_failures_and_survivals() -> None:
-    """Else the comparison above would say nothing of the rules."""
+    """The comparison above covers the rules only if some plans fail and some survive."""
     model, actions = _model(), _plans(2, 5, 6)
     with torch.no_grad():
         carry = model.expand_candidates(_carry(2))
@@ -150,7 +194,10 @@ def test_reference_loop_covers_failures_and_survivals() -> None:
 
 # --- the search ---------------------------------------------------------------------------
 class _Earning(PointWorld):
-    """A point that earns its negative squared distance from the goal; Q is told separately."""
+    """A point that earns its negative squared distance from the goal.
+
+    Q has another optimum: half the goal.
+    """
 
     discount = torch.tensor(0.9)
 
@@ -188,12 +235,19 @@ def test_a_policy_acts_by_every_objective_and_horizon(objective: Any, horizon: i
     assert config.actions == horizon + (objective == "td")
 
 
-# --- refusals -----------------------------------------------------------------------------
+# --- backends and refusals ----------------------------------------------------------------
+class _Subclass(WorldModel):
+    """It could override methods that the packed networks do not call."""
+
+
 @pytest.mark.parametrize("objective", ["reward", "td"])
 def test_only_eager_and_subclasses_use_the_reference(objective: Any) -> None:
     for backend, slow in (("auto", False), ("eager", True)):
         config = plain_planner(objective=objective, backend=backend)  # type: ignore[arg-type]
         assert isinstance(make_evaluator(_model(), config), ReferenceEvaluator) == slow
+    subclass = _Subclass(EARNING).requires_grad_(False).eval()
+    config = plain_planner(objective=objective, backend="auto")
+    assert isinstance(make_evaluator(subclass, config), ReferenceEvaluator)
 
 
 @pytest.mark.parametrize("objective", ["reward", "td"])
@@ -209,56 +263,3 @@ def test_sampling_from_an_untrained_prior_std_is_refused() -> None:
         require_compatible(autoregressive, plain_planner(latent="sample"))
     require_compatible(autoregressive, plain_planner())
     require_compatible(DEBUG, plain_planner(latent="sample"))
-
-
-MIXED_VALUES = [8.0, 4.0, -2.0, 6.0]
-FLOOR = -10.0
-
-
-def _objective(
-    rule: TerminationRule, deaths: list[float], values: list[float] = MIXED_VALUES
-) -> float:
-    world = ScriptedWorld(values, deaths, floor=FLOOR)
-    actions = torch.zeros(1, 1, len(values), 7)
-    config = PlannerConfig(termination_rule=rule)
-    return evaluate(world, world.start(), actions, config).item()
-
-
-@pytest.mark.parametrize("rule", ["paper", "shift", "survival"])
-def test_without_a_failure_the_objective_is_the_mean_value(rule: TerminationRule) -> None:
-    assert _objective(rule, [0.0] * 4) == pytest.approx(sum(MIXED_VALUES) / 4)
-
-
-@pytest.mark.parametrize(
-    ("rule", "deaths", "expected"),
-    [
-        # The failed state's own value counts, later ones are lost.
-        ("paper", [0, 0.95, 0, 0], (8 + 4 + 0 + 0) / 4),
-        ("paper", [0, 0, 0.95, 0], (8 + 4 - 2 + 0) / 4),
-        ("shift", [0, 0.95, 0, 0], (8 + 4 - 10 - 10) / 4),
-        ("shift", [0, 0, 0.95, 0], (8 + 4 - 2 - 10) / 4),
-        # Each value above the floor, weighted with the probability of being alive.
-        ("survival", [0, 0.5, 0, 0], (8 + 4 + (0.5 * 8 - 10) + (0.5 * 16 - 10)) / 4),
-        ("survival", [0, 0.5, 0.5, 0], (8 + 4 + (0.5 * 8 - 10) + (0.25 * 16 - 10)) / 4),
-        ("survival", [0, 1.0, 0, 0], (8 + 4 - 10 - 10) / 4),
-        # At the threshold is not beyond it.
-        ("paper", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
-        ("shift", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
-        # The observed state is alive, whatever D says; after the last step nothing follows.
-        ("paper", [1.0, 0, 0, 0], sum(MIXED_VALUES) / 4),
-        ("survival", [1.0, 0, 0, 1.0], sum(MIXED_VALUES) / 4),
-        # Dead stays dead.
-        ("paper", [0, 0.95, 0.0, 0.0], (8 + 4) / 4),
-    ],
-)
-def test_the_objective_after_a_failure(
-    rule: TerminationRule, deaths: list[float], expected: float
-) -> None:
-    assert _objective(rule, deaths) == pytest.approx(expected)
-
-
-def test_only_the_papers_rule_rewards_falling_when_values_are_negative() -> None:
-    values, alive, dead = [-1.0, -1.0, -5.0, -5.0], [0.0] * 4, [0.0, 1.0, 0.0, 0.0]
-    assert _objective("paper", dead, values) > _objective("paper", alive, values)
-    assert _objective("shift", dead, values) < _objective("shift", alive, values)
-    assert _objective("survival", dead, values) < _objective("survival", alive, values)

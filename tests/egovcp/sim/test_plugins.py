@@ -12,6 +12,7 @@ import egovcp.sim.tasks.registry as registry
 from egovcp.checks import ConformanceError, check_task
 from egovcp.entry_point import EntryPoint
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.sim.base_env import Observation
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
@@ -128,7 +129,7 @@ def test_a_conforming_task_is_measured() -> None:
         (
             'self.sample("distance")',
             'self.sample("distance"); self.parameters["x"] = float(np.random.rand())',
-            "task post, episode 0: a second run draws others",
+            "task post, episode 0: its parameters differ in a second run; draw them with sample",
         ),
         ('{"touch": 0.25}', '{"touch": 0.25 + np.random.rand()}', "reward differs"),
         ('{"touch": 0.25}', '{"touch": 2000.0}', r"0\.04 s: reward term touch is 2000\.0"),
@@ -154,6 +155,34 @@ def test_what_does_not_conform_is_named(
 ) -> None:
     changed(tmp_path, monkeypatch, old, new)
     with pytest.raises(ConformanceError, match=message):
+        check_task("post")
+
+
+def test_a_failed_check_closes_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[VectorEnv] = []
+    monkeypatch.setattr(VectorEnv, "close", lambda env: closed.append(env))
+    changed(tmp_path, monkeypatch, '{"touch": 0.25}', '{"touch": 2000.0}')
+    with pytest.raises(ConformanceError):
+        check_task("post")
+    assert len(closed) == 1
+
+
+def test_a_late_state_that_is_not_finite_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`check_env` plays the first ten ticks only."""
+    observe = VectorEnv._observe
+
+    def late_nan(env: VectorEnv) -> Observation:
+        observation = observe(env)
+        observation.state[[instance.tick >= 12 for instance in env.instances]] = np.nan
+        return observation
+
+    monkeypatch.setattr(VectorEnv, "_observe", late_nan)
+    changed(tmp_path, monkeypatch, "ticks=6", "ticks=14")
+    with pytest.raises(ConformanceError, match=r"episode 0, 0\.48 s: its state is not finite"):
         check_task("post")
 
 

@@ -17,15 +17,15 @@ def walk(env: VectorEnv, policy: RandomWalk, ticks: int, first: int = 0) -> np.n
     return np.array([policy.act(env) for _ in range(ticks)])
 
 
-@pytest.mark.parametrize("bounds", ["reflect", "clip"])
-def test_a_walk_stays_in_the_box_in_steps_of_eta_at_most(env: VectorEnv, bounds: str) -> None:
-    actions = walk(env, RandomWalk(bounds=bounds), 300)
+@pytest.mark.parametrize("boundary", ["reflect", "clip"])
+def test_a_walk_stays_in_the_box_in_steps_of_eta_at_most(env: VectorEnv, boundary: str) -> None:
+    actions = walk(env, RandomWalk(boundary=boundary), 300)
     assert np.abs(actions).max() <= 1.0
     assert np.abs(np.diff(actions, axis=0)).max() <= ACTION_ETA
 
 
 def test_reflection_fills_the_box_evenly_and_clipping_piles_up(env: VectorEnv) -> None:
-    even, piled = (walk(env, RandomWalk(bounds=b), 2000)[100:] for b in ("reflect", "clip"))
+    even, piled = (walk(env, RandomWalk(boundary=b), 2000)[100:] for b in ("reflect", "clip"))
     assert np.mean(np.abs(even) > 0.9) == pytest.approx(0.1, abs=0.02)
     assert np.mean(np.abs(piled) > 0.9) > 0.15
 

@@ -14,7 +14,8 @@ TICK = 0.04
 
 
 def track(reach: list[float], speed: list[float]) -> BehaviourTrace:
-    """Hands that reach forward by so much in each tick, m; the push comes at tick 1."""
+    """One hand `reach` m ahead of its start and the pelvis at `speed` m/s in each tick; the push
+    comes at tick 1."""
     hands = [np.array([[0.3 + r, 0.2, 0.1], [0.3, -0.2, 0.1]]) for r in reach]
     since = [(t - 1) * TICK for t in range(len(reach))]
     zeros = [0.0] * len(reach)

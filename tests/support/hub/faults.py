@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 type Trouble = int | Literal["reset", "stall", "truncate", "lose"]
-"""What to do to a request: answer it with that HTTP status, or
+"""What to do to a request: respond with that HTTP status, or
 
-- ``reset``: break the connection instead of answering,
-- ``stall``: send half of the answer's body, then nothing; no answer if it has no body,
-- ``truncate``: send half of the answer's body, then close the connection; break it if the body is
-  empty, and answer a HEAD request as usual,
+- ``reset``: break the connection instead of responding,
+- ``stall``: send half of the response's body, then nothing; no response if it has no body,
+- ``truncate``: send half of the response's body, then close the connection; break it if the body is
+  empty, and respond to a HEAD request as usual,
 - ``lose``: do what was asked, then break the connection.
 """
 
@@ -34,7 +34,7 @@ class Fault:
     retry_after: int | None = None
     """Seconds of the ``Retry-After`` header of a status; None: no such header."""
     message: str = ""
-    """What the answer says."""
+    """The error message of the response."""
 
 
 class Faults:

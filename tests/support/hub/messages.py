@@ -1,4 +1,4 @@
-"""A request that has arrived and the answer to it, free of sockets."""
+"""A request that has arrived and its response, independent of sockets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Request:
-    """What a client asks."""
+    """A request of a client."""
 
     endpoint: str
     """The server's own address, for links."""
@@ -45,8 +45,8 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What the server says: text in memory, or a range of a file."""
+class Response:
+    """A response of the server: text in memory, or a range of a file."""
 
     status: int = 200
     body: bytes = b""
@@ -74,10 +74,12 @@ class Answer:
                 yield chunk
 
 
-def say(content: object, status: int = 200, headers: Mapping[str, str] | None = None) -> Answer:
-    """An answer in JSON."""
+def json_response(
+    content: object, status: int = 200, headers: Mapping[str, str] | None = None
+) -> Response:
+    """A response in JSON."""
     kind = {"Content-Type": "application/json", **(headers or {})}
-    return Answer(status, json.dumps(content).encode(), kind)
+    return Response(status, json.dumps(content).encode(), kind)
 
 
 def arriving(file: BinaryIO, headers: Mapping[str, str]) -> Iterator[bytes]:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from tests.support.hub.messages import Answer, Request, say
-from tests.support.hub.store import Refusal, Store
+from tests.support.hub.messages import Request, Response, json_response
+from tests.support.hub.store import HttpError, Store
 
 _DATE = "2026-01-01T00:00:00.000Z"
 
 
-def whoami(store: Store, request: Request) -> Answer:
+def whoami(store: Store, request: Request) -> Response:
     """Everybody is the same user."""
-    return say({"type": "user", "id": "0", "name": "user", "fullname": "User", "orgs": []})
+    return json_response(
+        {"type": "user", "id": "0", "name": "user", "fullname": "User", "orgs": []}
+    )
 
 
-def create(store: Store, request: Request) -> Answer:
-    """Make a repository; 409 if it exists, with the same address in the answer."""
+def create(store: Store, request: Request) -> Response:
+    """Make a repository; 409 if it exists, with the same address in the response."""
     wish = request.json()
     repo = f"{wish.get('organization') or 'user'}/{wish['name']}"
     kind = f"{wish.get('type') or 'model'}s"
@@ -25,15 +27,15 @@ def create(store: Store, request: Request) -> Answer:
     made = {"url": f"{request.endpoint}/{prefix}{repo}", "id": repo, "name": repo}
     try:
         store.create(f"{kind}/{repo}", private)
-    except Refusal as refusal:
-        return say({"error": refusal.message, **made}, refusal.status)
-    return say(made)
+    except HttpError as error:
+        return json_response({"error": error.message, **made}, error.status)
+    return json_response(made)
 
 
-def info(store: Store, request: Request) -> Answer:
+def info(store: Store, request: Request) -> Response:
     """Describe a repository at a revision."""
     commit = store.commit(request.repo, request.parts.get("revision", "main"))
-    return say(
+    return json_response(
         {
             "_id": commit.sha[:24],
             "id": request.parts["repo"],
@@ -52,7 +54,7 @@ def info(store: Store, request: Request) -> Answer:
     )
 
 
-def refs(store: Store, request: Request) -> Answer:
+def refs(store: Store, request: Request) -> Response:
     """List branches and tags."""
     found = store.refs(request.repo)
 
@@ -62,7 +64,7 @@ def refs(store: Store, request: Request) -> Answer:
             for name, sha in names.items()
         ]
 
-    return say(
+    return json_response(
         {
             "branches": entries(found.branches, "heads"),
             "tags": entries(found.tags, "tags"),
@@ -72,10 +74,10 @@ def refs(store: Store, request: Request) -> Answer:
     )
 
 
-def commits(store: Store, request: Request) -> Answer:
+def commits(store: Store, request: Request) -> Response:
     """List commits, the newest first."""
     history = store.history(request.repo, request.parts["revision"])
-    return say(
+    return json_response(
         [
             {"id": c.sha, "title": c.title, "message": "", "authors": [], "date": _DATE}
             for c in history
@@ -83,26 +85,26 @@ def commits(store: Store, request: Request) -> Answer:
     )
 
 
-def tag(store: Store, request: Request) -> Answer:
+def tag(store: Store, request: Request) -> Response:
     """Name a commit; 409 if the tag exists."""
     store.tag(request.repo, request.json()["tag"], request.parts["revision"])
-    return say({})
+    return json_response({})
 
 
-def untag(store: Store, request: Request) -> Answer:
+def untag(store: Store, request: Request) -> Response:
     """Remove a tag."""
     store.tag(request.repo, request.parts["name"], None)
-    return say({})
+    return json_response({})
 
 
-def branch(store: Store, request: Request) -> Answer:
+def branch(store: Store, request: Request) -> Response:
     """Start a branch; 409 if it exists."""
     start = request.json().get("startingPoint") or "main"
     store.branch(request.repo, request.parts["name"], start)
-    return say({})
+    return json_response({})
 
 
-def unbranch(store: Store, request: Request) -> Answer:
+def unbranch(store: Store, request: Request) -> Response:
     """Remove a branch."""
     store.branch(request.repo, request.parts["name"], None)
-    return say({})
+    return json_response({})

@@ -1,4 +1,4 @@
-"""Which function answers which request."""
+"""Routes: method and path pattern -> function that returns the response."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.support.hub import files, repositories, uploads
-from tests.support.hub.messages import Answer, Request
+from tests.support.hub.messages import Request, Response
 from tests.support.hub.store import Store
 
 _REPO = r"(?P<repo>[^/]+/[^/]+)"
@@ -24,13 +24,13 @@ class Route:
     name: str
     method: str
     pattern: re.Pattern[str]
-    answer: Callable[[Store, Request], Answer]
+    handler: Callable[[Store, Request], Response]
 
 
 def _route(
-    name: str, method: str, pattern: str, answer: Callable[[Store, Request], Answer]
+    name: str, method: str, pattern: str, handler: Callable[[Store, Request], Response]
 ) -> Route:
-    return Route(name, method, re.compile(pattern), answer)
+    return Route(name, method, re.compile(pattern), handler)
 
 
 #: Tried from top to bottom.

@@ -14,9 +14,9 @@ from typing import Self
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tests.support.hub.faults import EVER, Fault, Faults, Trouble
-from tests.support.hub.messages import Answer, Request, arriving, say
+from tests.support.hub.messages import Request, Response, arriving, json_response
 from tests.support.hub.routes import ROUTES, Route
-from tests.support.hub.store import Refusal, Store
+from tests.support.hub.store import HttpError, Store
 
 _STALL_S = 3600.0
 _READING = {"GET", "HEAD"}
@@ -68,7 +68,7 @@ class FakeHub:
         self.faults.clear()
 
     def serve(self) -> None:
-        """Answer requests until `close`."""
+        """Respond to requests until `close`."""
         self._server.serve_forever(poll_interval=0.05)
 
     def close(self) -> None:
@@ -128,31 +128,33 @@ class _Handler(BaseHTTPRequestHandler):
         if trouble == "reset":
             return self._break()
         if fault is not None and isinstance(trouble, int):
-            answer = _refuse(Refusal(trouble, fault.message or "as ordered"), fault.retry_after)
+            response = _error_response(
+                HttpError(trouble, fault.message or "as ordered"), fault.retry_after
+            )
         else:
-            answer = self._answer(route, request)
+            response = self._respond(route, request)
         for _ in request.body:  # what no route has read: the connection is used again
             pass
         half = trouble in ("stall", "truncate")
         if trouble == "truncate" and self.command == "HEAD":
             half = False  # complete without a body: the client uses the connection again
-        empty = answer.size == 0 or self.command == "HEAD"
+        empty = response.size == 0 or self.command == "HEAD"
         if trouble == "stall" and empty:
             self.hub.closing.wait(_STALL_S)
         if trouble == "lose" or (half and empty):
             return self._break()
-        return self._send(answer, half, stall=trouble == "stall")
+        return self._send(response, half, stall=trouble == "stall")
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = _handle  # noqa: N815
 
-    def _answer(self, route: Route | None, request: Request) -> Answer:
+    def _respond(self, route: Route | None, request: Request) -> Response:
         try:
             if route is None:
-                raise Refusal(404, f"no route for {self.command} {self.path}")
+                raise HttpError(404, f"no route for {self.command} {self.path}")
             self._authorize(route, request)
-            return route.answer(self.hub.store, request)
-        except Refusal as refusal:
-            return _refuse(refusal, None)
+            return route.handler(self.hub.store, request)
+        except HttpError as error:
+            return _error_response(error, None)
 
     def _authorize(self, route: Route, request: Request) -> None:
         token = request.headers.get("authorization", "").removeprefix("Bearer ")
@@ -162,18 +164,18 @@ class _Handler(BaseHTTPRequestHandler):
         if "repo" in request.parts and public and not self.hub.store.refs(request.repo).private:
             return
         if token or route.name != "create":
-            raise Refusal(401, "Invalid username or password.")
-        raise Refusal(401, "Unauthorized")
+            raise HttpError(401, "Invalid username or password.")
+        raise HttpError(401, "Unauthorized")
 
-    def _send(self, answer: Answer, half: bool, stall: bool) -> None:
-        self.send_response(answer.status)
-        for name, value in answer.headers.items():
+    def _send(self, response: Response, half: bool, stall: bool) -> None:
+        self.send_response(response.status)
+        for name, value in response.headers.items():
             self.send_header(name, value)
-        self.send_header("Content-Length", str(answer.size))
+        self.send_header("Content-Length", str(response.size))
         self.end_headers()
-        limit = answer.size // 2 if half else answer.size
+        limit = response.size // 2 if half else response.size
         if self.command != "HEAD":
-            for chunk in answer.chunks(limit):
+            for chunk in response.chunks(limit):
                 self.wfile.write(chunk)
         if stall:
             self.hub.closing.wait(_STALL_S)
@@ -197,10 +199,10 @@ def _find(method: str, path: str) -> tuple[Route | None, dict[str, str]]:
     return None, {}
 
 
-def _refuse(refusal: Refusal, retry_after: int | None) -> Answer:
-    headers = {"Content-Type": "application/json", "X-Error-Message": refusal.message}
-    if refusal.code:
-        headers["X-Error-Code"] = refusal.code
+def _error_response(error: HttpError, retry_after: int | None) -> Response:
+    headers = {"Content-Type": "application/json", "X-Error-Message": error.message}
+    if error.code:
+        headers["X-Error-Code"] = error.code
     if retry_after is not None:
         headers["Retry-After"] = str(retry_after)
-    return say({"error": refusal.message}, refusal.status, headers)
+    return json_response({"error": error.message}, error.status, headers)

@@ -16,8 +16,8 @@ from functools import lru_cache
 from pathlib import Path
 
 
-class Refusal(Exception):
-    """The Hub says no: an HTTP status, a message, and the Hub's code for the reason."""
+class HttpError(Exception):
+    """An error response: HTTP status, message, and the Hub's code for the reason."""
 
     def __init__(self, status: int, message: str, code: str = "") -> None:
         super().__init__(message)
@@ -90,7 +90,7 @@ class Store:
                     size += file.write(chunk)
             found = digest.hexdigest()
             if sha256 and found != sha256:
-                raise Refusal(400, f"content has SHA-256 {found}, not {sha256}")
+                raise HttpError(400, f"content has SHA-256 {found}, not {sha256}")
             partial.replace(self.blob(found))
         finally:
             partial.unlink(missing_ok=True)
@@ -106,7 +106,7 @@ class Store:
         with self._lock:
             folder = self._folder(repo)
             if (folder / "refs.json").exists():
-                raise Refusal(409, "You already created this repo")
+                raise HttpError(409, "You already created this repo")
             folder.mkdir(parents=True, exist_ok=True)
             first = {".gitattributes": self.add_small(b"*.parquet filter=lfs diff=lfs -text\n")}
             commit = self._write_commit(repo, "", "initial commit", first)
@@ -117,7 +117,7 @@ class Store:
         try:
             content = json.loads((self._folder(repo) / "refs.json").read_text(encoding="utf-8"))
         except FileNotFoundError as error:
-            raise Refusal(404, "Repository not found", "RepoNotFound") from error
+            raise HttpError(404, "Repository not found", "RepoNotFound") from error
         return Refs(**content)
 
     def commit(self, repo: str, revision: str) -> Commit:
@@ -127,7 +127,7 @@ class Store:
         hexadecimal = len(sha) >= 7 and set(sha) <= set("0123456789abcdef")
         found = sorted(self._folder(repo).glob(f"{sha}*.json")) if hexadecimal else []
         if not found:
-            raise Refusal(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+            raise HttpError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
         return self._load(found[0])
 
     def history(self, repo: str, revision: str) -> list[Commit]:
@@ -144,16 +144,16 @@ class Store:
         with self._lock:
             refs = self.refs(repo)
             if branch not in refs.branches:
-                raise Refusal(404, f"Invalid rev id: {branch}", "RevisionNotFound")
+                raise HttpError(404, f"Invalid rev id: {branch}", "RevisionNotFound")
             head = self.commit(repo, refs.branches[branch])
             if parent and parent != head.sha:
-                raise Refusal(412, "A commit has happened since. Please refresh and try again.")
+                raise HttpError(412, "A commit has happened since. Please refresh and try again.")
             after = dict(head.files)
             for path, file in files.items():
                 if file is not None:
                     after[path] = file
                 elif after.pop(path, None) is None:
-                    raise Refusal(404, "A file with this name doesn't exist", "EntryNotFound")
+                    raise HttpError(404, "A file with this name doesn't exist", "EntryNotFound")
             commit = self._write_commit(repo, head.sha, title, after)
             self._write_refs(repo, replace(refs, branches={**refs.branches, branch: commit.sha}))
             return commit
@@ -175,11 +175,11 @@ class Store:
         self, repo: str, names: Mapping[str, str], name: str, revision: str | None
     ) -> dict[str, str]:
         if revision is None and name not in names:
-            raise Refusal(404, f"No such reference: {name}", "RevisionNotFound")
+            raise HttpError(404, f"No such reference: {name}", "RevisionNotFound")
         if revision is None:
             return {key: sha for key, sha in names.items() if key != name}
         if name in names:
-            raise Refusal(409, f"Reference {name} exists already")
+            raise HttpError(409, f"Reference {name} exists already")
         return {**names, name: self.commit(repo, revision).sha}
 
     def _folder(self, repo: str) -> Path:

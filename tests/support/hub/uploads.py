@@ -7,24 +7,24 @@ import json
 from pathlib import PurePosixPath
 from typing import Any
 
-from tests.support.hub.messages import Answer, Request, say
-from tests.support.hub.store import Commit, File, Refusal, Store, pointer_oid
+from tests.support.hub.messages import Request, Response, json_response
+from tests.support.hub.store import Commit, File, HttpError, Store, pointer_oid
 
 _LARGE = 10 * 2**20  # bytes
 _LARGE_SUFFIXES = {".parquet", ".png", ".jpg", ".mp4", ".safetensors", ".bin", ".onnx", ".rrd"}
 
 
-def validate(store: Store, request: Request) -> Answer:
+def validate(store: Store, request: Request) -> Response:
     """Accept any card."""
     request.content()
-    return say({"errors": [], "warnings": []})
+    return json_response({"errors": [], "warnings": []})
 
 
-def preupload(store: Store, request: Request) -> Answer:
+def preupload(store: Store, request: Request) -> Response:
     """Say of each file whether it is a large one, and what the branch has in its place."""
     head = store.commit(request.repo, request.parts["revision"])
     files = request.json()["files"]
-    return say({"files": [_mode(head, file) for file in files]})
+    return json_response({"files": [_mode(head, file) for file in files]})
 
 
 def _mode(head: Commit, file: dict[str, Any]) -> dict[str, Any]:
@@ -37,10 +37,10 @@ def _mode(head: Commit, file: dict[str, Any]) -> dict[str, Any]:
     return mode
 
 
-def lfs_batch(store: Store, request: Request) -> Answer:
+def lfs_batch(store: Store, request: Request) -> Response:
     """Say where to put each large file that is not here yet."""
     store.refs(request.repo)
-    return say(
+    return json_response(
         {
             "transfer": "basic",
             "objects": [
@@ -59,21 +59,21 @@ def _object(store: Store, endpoint: str, oid: str, size: int) -> dict[str, Any]:
     return found
 
 
-def lfs_upload(store: Store, request: Request) -> Answer:
+def lfs_upload(store: Store, request: Request) -> Response:
     """Take a large file."""
     store.add_blob(request.body, request.parts["oid"])
-    return Answer(headers={"ETag": f'"{request.parts["oid"]}"'})
+    return Response(headers={"ETag": f'"{request.parts["oid"]}"'})
 
 
-def lfs_verify(store: Store, request: Request) -> Answer:
+def lfs_verify(store: Store, request: Request) -> Response:
     """Confirm that a large file has arrived."""
     blob = store.blob(request.parts["oid"])
     if not blob.exists() or blob.stat().st_size != request.json()["size"]:
-        raise Refusal(404, "no such object")
-    return say({})
+        raise HttpError(404, "no such object")
+    return json_response({})
 
 
-def commit(store: Store, request: Request) -> Answer:
+def commit(store: Store, request: Request) -> Response:
     """Change many files at once: all of it, or nothing."""
     lines = [json.loads(line) for line in request.content().splitlines() if line]
     header = next(line["value"] for line in lines if line["key"] == "header")
@@ -89,7 +89,9 @@ def commit(store: Store, request: Request) -> Answer:
         changes,
     )
     url = f"{request.endpoint}/{request.repo}/commit/{made.sha}"
-    return say({"success": True, "commitOid": made.sha, "commitUrl": url, "hookOutput": ""})
+    return json_response(
+        {"success": True, "commitOid": made.sha, "commitUrl": url, "hookOutput": ""}
+    )
 
 
 def _change(store: Store, head: Commit, key: str, value: dict[str, Any]) -> dict[str, File | None]:
@@ -105,7 +107,7 @@ def _change(store: Store, head: Commit, key: str, value: dict[str, Any]) -> dict
     if key == "lfsFile":
         blob, oid = store.blob(value["oid"]), str(value["oid"])
         if not blob.exists():
-            raise Refusal(400, f"the content of {path} was never uploaded")
+            raise HttpError(400, f"the content of {path} was never uploaded")
         size = blob.stat().st_size
         return {path: File(oid, size, pointer_oid(oid, size), lfs=True)}
-    raise Refusal(400, f"unknown operation {key}")
+    raise HttpError(400, f"unknown operation {key}")
