@@ -19,7 +19,7 @@ from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.provenance import DuplicateFinder
 from egovcp.data.source import Source, locate
-from egovcp.data.staging import encode, with_index
+from egovcp.data.staging import episode_stats
 from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError
 
@@ -67,9 +67,9 @@ def dataset_problems(
         if episode is not None and not problems:
             for frame, problem in command_problems(episode):
                 yield DataError.at(reader.data_path(index), problem, index, frame)
-            encoded = encode(episode)
-            matrices.append(with_index(encoded, 0, 0, 0)[1])
-            yield from _duplicate_problems(reader, duplicates, index, encoded.record["sha256"])
+            matrices.append(episode_stats(episode))
+            digest = reader.digest(index) or episode.digest()  # a recorded one has been compared
+            yield from _duplicate_problems(reader, duplicates, index, digest)
             if index in check.by_number:
                 row = check.by_number[index]
                 yield from _episode_statistics_problems(reader, row, matrices[-1])

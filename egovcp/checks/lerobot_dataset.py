@@ -132,12 +132,18 @@ class LeRobotCheck:
             problem = f"columns that {schema.INFO_PATH} does not know: {', '.join(unknown)}"
             yield DataError.at(path, problem)
         present = [key for key in columns if key in names]
-        found = set[int]()
+        found, damaged = set[int](), set[int]()
         for part in self.reader.episodes(path, present):
             if isinstance(part, DataError):
                 yield part
+                if part.episode in self.by_number and part.episode not in found:
+                    self._frames += self.by_number[part.episode].length
+                    found.add(part.episode)
+                    damaged.add(part.episode)
                 continue
             number, table = part
+            if number in damaged:  # its rows in another row group
+                continue
             found.add(number)
             yield from self._listed_episode_problems(path, number, table)
             if progress is not None:

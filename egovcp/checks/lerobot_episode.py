@@ -164,9 +164,9 @@ def camera_statistics_problems(found: Mapping[str, object], feature: Feature) ->
 
 
 def numbers_in(value: object) -> NDArray[np.float64] | None:
-    """Nested lists of numbers as a flat array; None if they hold other values."""
+    """Nested lists of numbers or booleans as a flat array; None if they hold other values."""
     try:
         array = np.array(value)
     except ValueError:  # lists of different lengths
         return None
-    return array.ravel().astype(np.float64) if array.dtype.kind in "iuf" else None
+    return array.ravel().astype(np.float64) if array.dtype.kind in "biuf" else None

@@ -8,24 +8,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from egovcp import spec
 from egovcp.artifact import Artifact, load_artifact
 from egovcp.errors import ArtifactError, ConformanceError
 from egovcp.model import Carry, WorldModel
+from egovcp.robot_spec import RobotSpec
 
 TOLERANCE = 1e-4  # rounding of network outputs
 
 
 class RandomInputs:
-    """Random inputs for B rows, given by the seed."""
+    """Random inputs of a robot for B rows, given by the seed."""
 
-    def __init__(self, rows: int, seed: int) -> None:
+    def __init__(self, rows: int, seed: int, robot: RobotSpec) -> None:
         rng = torch.Generator().manual_seed(seed)
-        self.action = torch.rand(rows, spec.ACTION_DIM, generator=rng) * 2 - 1
-        pixels = (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-        self.depth = torch.randint(0, 5000, pixels, generator=rng, dtype=torch.int32)
-        self.state = torch.randn(rows, spec.STATE_DIM, generator=rng)
-        self.plans = torch.rand(rows, 3, spec.ACTION_DIM, generator=rng) * 2 - 1
+        self.action = torch.rand(rows, robot.action_dim, generator=rng) * 2 - 1
+        pixels, farthest = (rows, *robot.depth), round(1000 * robot.depth_max_m)
+        self.depth = torch.randint(0, farthest, pixels, generator=rng, dtype=torch.int32)
+        self.state = torch.randn(rows, robot.state_dim, generator=rng)
+        self.plans = torch.rand(rows, 3, robot.action_dim, generator=rng) * 2 - 1
 
 
 @torch.no_grad()
@@ -37,7 +37,7 @@ def check_world_model(model: WorldModel) -> None:
     """
     rows = 3
     first, rest = torch.ones(rows, dtype=torch.bool), torch.zeros(rows, dtype=torch.bool)
-    one, two = RandomInputs(rows, 0), RandomInputs(rows, 1)
+    one, two = (RandomInputs(rows, seed, model.robot) for seed in range(2))
     start = model.observe(model.initial(rows), one.action, one.depth, one.state, first)
     before = copy.deepcopy(start)
     later = model.observe(start, two.action, two.depth, two.state, rest)
@@ -100,7 +100,7 @@ def _check_planning(model: WorldModel, carry: Carry, plans: Tensor) -> None:
 def _check_decoder(model: WorldModel, carry: Carry) -> None:
     depth, state = model.decode(carry)
     found, rows = (tuple(depth.shape), tuple(state.shape)), len(carry.h)
-    expected = (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), (rows, spec.STATE_DIM)
+    expected = (rows, *model.robot.depth), (rows, model.robot.state_dim)
     _require(found == expected, f"decode gives {found[0]} and {found[1]}")
     _require(depth.isfinite().all() and state.isfinite().all(), "decode is not finite")
     _require((depth >= 0).all(), "decode gives negative depth")
@@ -124,7 +124,7 @@ def _same(problem: str, expected: Carry, found: Carry) -> None:
 def check_artifact(path: str, revision: str = "") -> Artifact:
     """Load an artifact, check its model, and let it plan once; raises `ArtifactError`."""
     artifact = load_artifact(path, revision)
-    inputs = RandomInputs(1, seed=0)
+    inputs = RandomInputs(1, 0, artifact.robot)
     try:
         check_world_model(artifact.world_model)
     except ConformanceError as error:

@@ -36,11 +36,19 @@ from egovcp.data.provenance import SOURCES, Provenance, parse_provenance
 from egovcp.data.reader import DatasetReader
 from egovcp.data.source import Source
 from egovcp.data.staging import EncodedEpisode, StagingDir, encode
-from egovcp.data.writer import VersionContents, VersionWriter, publish_version, recover, shard_paths
+from egovcp.data.writer import (
+    VersionContents,
+    VersionWriter,
+    aside_folder,
+    publish_version,
+    recover,
+    shard_paths,
+)
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.files import write_json
 
 _STAGING: Final = "sealed"  # name on disk, which unfinished collections of older versions have
+_NEXT: Final = "next"
 
 type CheckProvenance = Callable[[Provenance], None]
 
@@ -137,7 +145,7 @@ class Committer:
 
     @property
     def _next(self) -> Path:
-        return work_folder(self.root) / "next"
+        return work_folder(self.root) / _NEXT
 
     def _load(self, check: CheckProvenance) -> None:
         recover(self._next, self.root)
@@ -200,6 +208,11 @@ def _require_unused(root: Path, work: Path) -> None:
     if not is_vacant(root):
         raise UsageError(
             f"{root} exists already; continue it with --resume, or choose another --dataset.root"
+        )
+    if (aside := aside_folder(work / _NEXT)).exists():
+        raise UsageError(
+            f"a collection was interrupted while it replaced {root}, whose episodes are now in "
+            f"{aside}; continue it with --resume, which restores them"
         )
     if any((work / _STAGING).glob("*.arrow")):
         raise UsageError(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp import spec
+from egovcp.data import schema
 from egovcp.data.episode import Episode
 from egovcp.data.features import Feature, values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
@@ -90,6 +91,9 @@ def convert_dataset(
 
 def _choose(reader: LeRobotReader, features: Mapping[str, str]) -> dict[str, Feature]:
     """The feature of each input."""
+    for key in schema.INDEX_FEATURES:
+        if key not in reader.features:
+            raise DataError.at(reader.root / schema.INFO_PATH, f"feature {key} is missing")
     for name in features:
         if name not in INPUTS:
             raise UsageError(f"--features: unknown name {name!r}{suggest(name, INPUTS)}")
@@ -188,6 +192,9 @@ def _tables(
             row = left.pop(number, None)
             if row is None:
                 continue
+            for key in columns:  # pyarrow does not report a column that is missing
+                if key not in table.column_names:
+                    raise DataError.at(path, f"column {key} is missing", number)
             if table.num_rows != row.length:
                 problem = f"holds {table.num_rows} rows of it, expected {row.length}"
                 raise DataError.at(path, problem, number)
@@ -261,9 +268,10 @@ def _depth(image: NDArray[Any], robot: RobotSpec) -> NDArray[np.uint16]:
 
 
 def _task(reader: LeRobotReader, table: pa.Table) -> str:
-    number = int(table["task_index"][0].as_py())
+    number = int(values_of(table["task_index"], reader.features["task_index"])[0, 0])
     return reader.tasks.get(number, f"task {number}")
 
 
 def _placed(error: DataError, row: EpisodeRow) -> DataError:
-    return DataError.at(row.data_path, error.problem or str(error), row.index, error.frame)
+    path = error.file or row.data_path  # a video is another file
+    return DataError.at(path, error.problem or str(error), row.index, error.frame)

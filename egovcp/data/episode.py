@@ -20,6 +20,9 @@ _ACTION_SLACK = 1e-6  # float32 rounding of an action on the boundary of its box
 
 #: Longest episode, frames (33 minutes), because an episode is read as a whole.
 EPISODE_FRAMES: Final = 50_000
+#: Largest column of a row group, uncompressed. A row group holds one episode.
+COLUMN_BYTES: Final = 1 << 30
+_IMAGE_BYTES: Final = 128  # of a depth image besides its pixels: TIFF header, length, page headers
 
 type FrameLayout = tuple[tuple[int, ...], type[np.generic]]
 
@@ -131,6 +134,10 @@ def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
         yield None, "no frames, expected at least one"
     if length > EPISODE_FRAMES:
         yield None, f"{length} frames, expected at most {EPISODE_FRAMES}"
+    rows, cols = episode.robot.depth
+    most = COLUMN_BYTES // (_IMAGE_BYTES + 2 * rows * cols)
+    if length > most:
+        yield None, f"{length} frames, expected at most {most} with depth images of {rows}x{cols}"
     for name, (frame, dtype) in frame_layout(episode.robot).items():
         array, shape = getattr(episode, name), (length, *frame)
         if array.shape != shape or array.dtype != dtype:

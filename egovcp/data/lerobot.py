@@ -261,10 +261,13 @@ def episode_runs(
                 runs = list(_split_by_episode(table))
         except DataError as error:
             lost = _episode_numbers(file, group)
-            yield from (DataError.at(path, error.problem, n) for n in lost)
             if not lost:
                 yield DataError.at(path, f"{error.problem} (row group {group})")
-            parts = parts if number not in lost else []
+                continue
+            if parts and number not in lost:  # complete; episodes are returned in order
+                yield number, pa.concat_tables(parts)
+            yield from (DataError.at(path, error.problem, n) for n in lost)
+            parts = []
             continue
         for run_number, part in runs:
             if run_number != number and parts:

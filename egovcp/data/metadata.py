@@ -36,6 +36,8 @@ _TASKS: Final = 10_000
 _RECORD_BYTES: Final = 32_768  # 20 times the record of an episode
 _LARGEST_LIMIT: Final = 2**31 - 1
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+#: Column of the task names if their index has no name, as in files of LeRobot 0.4.
+_UNNAMED_INDEX: Final = "__index_level_0__"
 #: Folders in which every file must be listed in ``meta/sha256.json``, but for `_UNLISTED`.
 _HASHED = ("data", "meta")
 _UNLISTED = (schema.HASHES_PATH, schema.SOURCE_PATH)
@@ -226,12 +228,15 @@ def load_tasks(root: Path) -> dict[int, str]:
     path = root / schema.TASKS_PATH
     require_file(root, path)
     with data_errors(path):
-        table = open_parquet(path, _TASKS).read(columns=["task_index", "task"])
-        numbers, names = table["task_index"].to_pylist(), table["task"].to_pylist()
+        file = open_parquet(path, _TASKS)
+        found = file.schema_arrow.names
+        key = _UNNAMED_INDEX if _UNNAMED_INDEX in found and "task" not in found else "task"
+        table = file.read(columns=["task_index", key])
+        numbers, names = table["task_index"].to_pylist(), table[key].to_pylist()
     if not all(type(number) is int for number in numbers):
         raise DataError.at(path, f"column task_index is {table['task_index'].type}, expected int64")
     if not all(isinstance(name, str) for name in names):
-        raise DataError.at(path, f"column task is {table['task'].type}, expected strings")
+        raise DataError.at(path, f"column {key} is {table[key].type}, expected strings")
     if len(set(numbers)) != len(numbers) or len(set(names)) != len(names):
         raise DataError.at(path, f"lists a task twice: {names}, {numbers}")
     return dict(zip(numbers, names, strict=True))

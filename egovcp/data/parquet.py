@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import schema, tiff
+from egovcp.data.episode import COLUMN_BYTES
 from egovcp.data.features import parse_feature, values_of
 from egovcp.data.paths import require_file
 from egovcp.errors import DataError
@@ -29,7 +30,6 @@ ROW_GROUP_ROWS: Final = 65_536
 _OTHER_GROUP_ROWS: Final = 1 << 20  # what pyarrow writes by default
 _ROW_BYTES: Final = 65_536  # bounds a column chunk: ten times a depth image
 _ROW_VALUES: Final = 4096
-_CHUNK_BYTES: Final = 1 << 30
 _COLUMNS: Final = 4096
 _PADDING_BYTES: Final = 16 << 20  # page indexes and Bloom filters lie between the row groups
 #: Errors that pyarrow and its callers raise on damaged files.
@@ -124,7 +124,7 @@ def _row_problems(content: pq.FileMetaData, rows: int | None, own: bool) -> Iter
 
 
 def _column_problems(content: pq.FileMetaData, size: int, own: bool) -> Iterator[str]:
-    row_bytes, row_values = (_ROW_BYTES, _ROW_VALUES) if own else (_CHUNK_BYTES, _CHUNK_BYTES)
+    row_bytes, row_values = (_ROW_BYTES, _ROW_VALUES) if own else (COLUMN_BYTES, COLUMN_BYTES)
     stored = content.serialized_size
     for number in range(content.num_row_groups):
         group = content.row_group(number)
@@ -133,7 +133,7 @@ def _column_problems(content: pq.FileMetaData, size: int, own: bool) -> Iterator
             stored += max(0, column.total_compressed_size)
             rows = group.num_rows + 1
             for unit, held, limit in (
-                ("bytes", column.total_uncompressed_size, min(_CHUNK_BYTES, row_bytes * rows)),
+                ("bytes", column.total_uncompressed_size, min(COLUMN_BYTES, row_bytes * rows)),
                 ("values", column.num_values, row_values * rows),
             ):
                 if not 0 <= held <= limit:

@@ -18,6 +18,9 @@ from egovcp.data.lerobot import EpisodeRow
 from egovcp.errors import DataError
 
 _LARGEST_CODE: Final = 4095  # of a depth video, 12 bits
+#: Smaller codes are invalid: `quantize_depth` clips depth 0 to code 0, which a lossy codec changes
+#: a little. Of LeRobot's default range these are depths below 28 mm, nearer than cameras measure.
+_LEAST_CODE: Final = 16
 #: LeRobot's defaults for depth videos, m.
 _DEPTH_RANGE: Final[Mapping[str, float]] = {"depth_min": 0.01, "depth_max": 10.0}
 _DEPTH_SHIFT: Final = 3.5
@@ -49,18 +52,21 @@ def camera_images(
             yield frame.to_ndarray(format="rgb24")
     if shown < len(times):
         problem = f"{camera.key} ends after {shown} of {len(times)} frames"
-        raise DataError.without_place(problem, shown)
+        raise DataError.at(span.path, problem, row.index, shown)
 
 
 def _depth_of(codes: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.float32]:
-    """Depth, m, of the codes of a depth video; the inverse of LeRobot's `quantize_depth`."""
+    """Depth, m, of the codes of a depth video, 0 where it is invalid; the inverse of LeRobot's
+    `quantize_depth`."""
     low, high = (float(info.get(f"video.{name}", value)) for name, value in _DEPTH_RANGE.items())
     fraction = codes.astype(np.float64) / _LARGEST_CODE
-    if not info.get("video.use_log", True):
-        return (low + fraction * (high - low)).astype(np.float32)
-    shift = float(info.get("video.shift", _DEPTH_SHIFT))
-    first, last = math.log(low + shift), math.log(high + shift)
-    return (np.exp(first + fraction * (last - first)) - shift).astype(np.float32)
+    if info.get("video.use_log", True):
+        shift = float(info.get("video.shift", _DEPTH_SHIFT))
+        first, last = math.log(low + shift), math.log(high + shift)
+        depth = np.exp(first + fraction * (last - first)) - shift
+    else:
+        depth = low + fraction * (high - low)
+    return np.where(codes < _LEAST_CODE, 0, depth).astype(np.float32)
 
 
 def decode_image(content: object, frame: int, key: str) -> Any:

@@ -9,8 +9,9 @@ shorter than the window is padded. All draws of a sampler come from one generato
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
+from threading import Thread
 from typing import Any, Final, Self
 
 import numpy as np
@@ -256,7 +257,6 @@ class PrefetchIterator:
         """``sampler`` must not be used otherwise; the first batch is made on the first call."""
         self._sampler = sampler
         self._state = sampler.state_dict()
-        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="batches")
         self._pending: Future[tuple[Batch, dict[str, Any]]] | None = None
 
     def __iter__(self) -> Iterator[Batch]:
@@ -264,9 +264,9 @@ class PrefetchIterator:
 
     def __next__(self) -> Batch:
         """The next batch; raises the errors of the sampler."""
-        pending = self._pending or self._worker.submit(self._make)
+        pending = self._pending or self._start()
         batch, self._state = pending.result()
-        self._pending = self._worker.submit(self._make)
+        self._pending = self._start()
         return batch
 
     def state_dict(self) -> dict[str, Any]:
@@ -282,8 +282,17 @@ class PrefetchIterator:
         self._state = self._sampler.state_dict()
         return self
 
-    def _make(self) -> tuple[Batch, dict[str, Any]]:
-        return next(self._sampler), self._sampler.state_dict()
+    def _start(self) -> Future[tuple[Batch, dict[str, Any]]]:
+        """Make the next batch in a daemon thread: the process may end while it waits for a file."""
+        pending: Future[tuple[Batch, dict[str, Any]]] = Future()
+        Thread(target=self._make, args=(pending,), name="batches", daemon=True).start()
+        return pending
+
+    def _make(self, pending: Future[tuple[Batch, dict[str, Any]]]) -> None:
+        try:
+            pending.set_result((next(self._sampler), self._sampler.state_dict()))
+        except BaseException as error:  # noqa: BLE001 - raised by the future
+            pending.set_exception(error)
 
 
 def _finish(

@@ -52,9 +52,7 @@ class EncodedEpisode:
 def encode(episode: Episode, where: str = "episode") -> EncodedEpisode:
     """Validate and encode an episode; ``where`` names it in errors (see `Episode.validate`)."""
     episode.validate(where)
-    columns: dict[str, NDArray[np.generic]] = {
-        key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()
-    }
+    columns = _columns(episode)
     names = [f"frame-{i:06d}.tiff" for i in range(len(episode))]
     image = pa.StructArray.from_arrays(
         [tiff.encode(episode.depth), pa.array(names)], ["bytes", "path"]
@@ -76,6 +74,10 @@ def encode(episode: Episode, where: str = "episode") -> EncodedEpisode:
     )
 
 
+def _columns(episode: Episode) -> dict[str, NDArray[np.generic]]:
+    return {key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()}
+
+
 def _arrow(values: NDArray[np.generic]) -> pa.Array:
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     return flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -85,19 +87,34 @@ def with_index(
     encoded: EncodedEpisode, episode_index: int, first_frame: int, task_index: int
 ) -> tuple[pa.Table, stats.Matrix]:
     """The rows of a data file, and their statistics (R, D), at a position in the dataset."""
-    frames = np.arange(len(encoded), dtype=np.int64)
-    columns: dict[str, NDArray[np.generic]] = {
-        "timestamp": (frames / encoded.robot.planner_hz).astype(np.float32),
-        "frame_index": frames,
-        "episode_index": np.full_like(frames, episode_index),
-        "index": frames + first_frame,
-        "task_index": np.full_like(frames, task_index),
-    }
+    columns = _index_columns(
+        len(encoded), encoded.robot.planner_hz, episode_index, first_frame, task_index
+    )
     ordered = schema.arrow_schema(encoded.robot)
     own = dict(zip(encoded.table.column_names, encoded.table.columns, strict=True))
     arrays = own | {key: pa.array(values) for key, values in columns.items()}
     table = pa.Table.from_arrays([arrays[field.name] for field in ordered], schema=ordered)
     return table, np.concatenate([encoded.stats, stats.index_stats(columns)], axis=1)
+
+
+def _index_columns(
+    length: int, hz: int, episode_index: int, first_frame: int, task_index: int
+) -> dict[str, NDArray[np.generic]]:
+    frames = np.arange(length, dtype=np.int64)
+    return {
+        "timestamp": (frames / hz).astype(np.float32),
+        "frame_index": frames,
+        "episode_index": np.full_like(frames, episode_index),
+        "index": frames + first_frame,
+        "task_index": np.full_like(frames, task_index),
+    }
+
+
+def episode_stats(episode: Episode) -> stats.Matrix:
+    """The statistics (R, D) of a valid episode as the first of a dataset."""
+    columns = _index_columns(len(episode), episode.robot.planner_hz, 0, 0, 0)
+    data = stats.data_stats(episode.depth, _columns(episode))
+    return np.concatenate([data, stats.index_stats(columns)], axis=1)
 
 
 def to_bytes(encoded: EncodedEpisode) -> pa.Buffer:

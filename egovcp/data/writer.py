@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import errno
 import json
-import secrets
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -325,7 +324,7 @@ def _exchange(folder: Path, root: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_EXCHANGE:
             raise
-        aside = _aside(folder)  # `recover` completes the three renames after a crash
+        aside = aside_folder(folder)  # `recover` completes the three renames after a crash
         dataset_files.rename(root, aside)
         dataset_files.rename(folder, root)
         dataset_files.rename(aside, folder)
@@ -333,7 +332,7 @@ def _exchange(folder: Path, root: Path) -> None:
 
 def recover(folder: Path, root: Path) -> None:
     """Restore the version that a crash within `publish_version` left aside."""
-    aside = _aside(folder)
+    aside = aside_folder(folder)
     if aside.exists():
         if is_vacant(root):
             dataset_files.rename(aside, root)
@@ -341,25 +340,25 @@ def recover(folder: Path, root: Path) -> None:
             shutil.rmtree(aside)
 
 
-def _aside(folder: Path) -> Path:
+def aside_folder(folder: Path) -> Path:
+    """Where `publish_version` keeps the previous version between two renames."""
     return folder.with_name(f"{folder.name}.before")
 
 
 class DatasetWriter:
-    """Context manager that adds episodes one by one to a temporary folder.
+    """Context manager that adds episodes one by one to the new dataset ``root`` (`new_dataset`).
 
-    At the end of the block the folder is moved to ``root``; on an error it is removed.
+    On an error in the block nothing is left.
     """
 
     def __init__(
         self, root: str | Path, provenance: Provenance, shard_episodes: int = schema.SHARD_EPISODES
     ) -> None:
-        """Create the temporary folder; ``root`` must be absent or an empty folder."""
+        """``root`` must be absent or an empty folder."""
         self.root = resolve_root(root)
         require_new(self.root)
         make_parent(self.root)
-        folder = self.root.with_name(f".{self.root.name}.{secrets.token_hex(4)}.partial")
-        self._version = VersionWriter(folder, provenance, VersionContents(shard_episodes))
+        self._provenance, self._contents = provenance, VersionContents(shard_episodes)
 
     @property
     def num_episodes(self) -> int:
@@ -374,14 +373,22 @@ class DatasetWriter:
         self._version.add(encode(episode, f"episode {self.num_episodes}"))
 
     def __enter__(self) -> Self:
+        self._block = self._new_version()
+        self._version = self._block.__enter__()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            if kind is None:
-                if self.num_episodes == 0:
+    def __exit__(self, *error: Any) -> None:
+        self._block.__exit__(*error)
+
+    @contextmanager
+    def _new_version(self) -> Iterator[VersionWriter]:
+        with new_dataset(self.root) as folder:
+            version = VersionWriter(folder, self._provenance, self._contents)
+            try:
+                yield version
+                if not version.episodes:
                     raise UsageError(f"no episode was written to {self.root}")
-                self._version.close()
-                publish_version(self._version.folder, self.root)
-        finally:
-            self._version.discard()
+                version.close()
+            except BaseException:
+                version.discard()
+                raise

@@ -22,6 +22,7 @@ from egovcp.data import DatasetConfig, DatasetWriter, Episode, Provenance
 from egovcp.errors import ArtifactError, DataError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig
+from egovcp.robot_spec import RobotSpec
 from egovcp.testing import toy_model
 from tests.support.environments import CountingEnv, ToyObservation, ToyStep
 from tests.support.models import CountingModel
@@ -115,6 +116,19 @@ def _save(path: Path, model: WorldModel) -> str:
 def test_a_good_artifact_passes(tmp_path: Path) -> None:
     artifact = check_artifact(_save(tmp_path / "policy", toy_model()))
     assert artifact.controller_id == "stance-1"
+
+
+def test_an_artifact_of_another_robot_passes(tmp_path: Path) -> None:
+    arm = RobotSpec(
+        robot_type="arm",
+        depth=(32, 48),
+        depth_max_m=1.5,
+        planner_hz=20,
+        state_names=("angle", "speed", "height"),
+        action_names=("lift", "grip"),
+        action_box=spec.ActionBox((-1.0, 0.0), (0.0, 0.5), (1.0, 1.0)),
+    )
+    assert check_artifact(_save(tmp_path / "policy", toy_model(robot=arm))).robot == arm
 
 
 @pytest.mark.parametrize("name", ["value_head", "gru"])
@@ -262,3 +276,14 @@ def test_a_dataset_shifted_in_time_is_refused(tmp_path: Path, shift: int) -> Non
     config = _write(tmp_path / "data", _walk(9), _walk(5, shift))
     with pytest.raises(DataError, match=r"episode 1, frame \d: the command.*one tick before"):
         check_dataset(config)
+
+
+def test_an_episode_is_validated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, calls = _write(tmp_path / "data", _walk(9), _walk(5)), list[str]()
+    for name in ("problems", "digest"):
+        function = getattr(Episode, name)
+        monkeypatch.setattr(
+            Episode, name, lambda self, n=name, f=function: (calls.append(n), f(self))[1]
+        )
+    check_dataset(config)
+    assert sorted(calls) == ["digest", "digest", "problems", "problems"]

@@ -35,10 +35,11 @@ def record_features(reader: LeRobotReader, row: EpisodeRow, output: Path) -> lis
         require_packages("egovcp", "a dataset with videos", "av")
     table = reader.read(row, [*(k for k, f in features.items() if f.dtype != "video"), "timestamp"])
     times = values_of(table["timestamp"], reader.features["timestamp"])[:, 0].astype(np.float64)
-    stream = rr.RecordingStream("egovcp", recording_id=f"{reader.root.name} episode {row.index}")
+    stream = rr.RecordingStream("egovcp")
     output.parent.mkdir(parents=True, exist_ok=True)
     with removed_on_error(output):
         stream.save(output)
+        stream.send_recording_name(f"{reader.root.name} episode {row.index}")
         for key, feature in features.items():
             if feature.is_camera:
                 _log_camera(stream, feature, camera_images(row, feature, table, times), times)

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from egovcp.data import Provenance
-from egovcp.data.index import SPLITS, in_split
 from egovcp_collect.dataset.cli import COMMANDS, main
 
 from .conftest import write
@@ -97,11 +96,6 @@ def test_info_shows_no_or_several_seeds(
     assert main(["info", str(root)]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("seed")]
     assert line.split()[1:] == [shown]
-
-
-@pytest.mark.parametrize("split", SPLITS)
-def test_no_episode_is_in_a_split_of_none(split: str) -> None:
-    assert in_split([], split) == []
 
 
 def test_info_reports_counts_and_provenance(sound: Path, tmp_path: Path) -> None:

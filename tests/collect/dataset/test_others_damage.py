@@ -1,8 +1,9 @@
 """Damage to datasets that LeRobot wrote: each kind is named with its file and episode."""
 
+import itertools
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from egovcp.checks.lerobot_dataset import lerobot_problems
 from egovcp.data.lerobot import LeRobotReader
 from egovcp.errors import DataError
 from egovcp_collect.dataset.cli import main
@@ -170,24 +172,54 @@ def test_what_is_not_checked_is_unknown_after_the_last_problem(
     assert "stopped" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("statistics", [True, False])
-def test_an_episode_is_read_beside_a_damaged_one(
-    statistics: bool, others: dict[str, Path], tmp_path: Path
-) -> None:
-    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
-    path, table = root / d.DATA, pq.read_table(root / d.DATA)
+def damage_row_group(path: Path, edges: Sequence[int], statistics: bool = True) -> None:
+    """Write row groups with these edges, and damage the second."""
+    table = pq.read_table(path)
     with pq.ParquetWriter(path, table.schema, write_statistics=statistics) as writer:
-        for first, length in ((0, 30), (30, 40), (70, 2)):
-            writer.write_table(table.slice(first, length))
+        for first, last in itertools.pairwise(edges):
+            writer.write_table(table.slice(first, last - first))
     column = pq.read_metadata(path).row_group(1).column(0)
     content = bytearray(path.read_bytes())
     start = column.dictionary_page_offset or column.data_page_offset
     content[start : start + 8] = b"\xff" * 8
     path.write_bytes(content)
+
+
+@pytest.mark.parametrize("statistics", [True, False])
+def test_an_episode_is_read_beside_a_damaged_one(
+    statistics: bool, others: dict[str, Path], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    damage_row_group(root / d.DATA, (0, 30, 70, 72), statistics)
     reader = LeRobotReader.open(root)
     assert reader.read(reader.rows[2], ["action"]).num_rows == 2
     with pytest.raises(DataError, match="episode 1: damaged"):
         reader.read(reader.rows[1], ["action"])
+
+
+@pytest.mark.parametrize("edges", [(0, 30, 70, 72), (0, 30, 50, 72), (0, 40, 70, 72)])
+def test_a_damaged_row_group_is_a_problem_of_its_episode_only(
+    edges: Sequence[int], others: dict[str, Path], tmp_path: Path
+) -> None:
+    """Episode 1 has rows 30 to 69."""
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    damage_row_group(root / d.DATA, edges)
+    (error,) = lerobot_problems(root)
+    assert error.episode == 1
+    assert "damaged" in error.problem
+
+
+def test_statistics_of_booleans_may_be_booleans(others: dict[str, Path], tmp_path: Path) -> None:
+    """As LeRobot 0.5 writes them, and 0.6 of episodes with a single frame."""
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    table = pq.read_table(root / d.EPISODES)
+    for name in ("min", "max"):
+        at = table.column_names.index(f"stats/next.done/{name}")
+        values = [[bool(x) for x in row] for row in table.column(at).to_pylist()]
+        table = table.set_column(at, table.column_names[at], pa.array(values))
+    pq.write_table(table, root / d.EPISODES)
+    d.statistic("next.done", "max", [True])(root)
+    assert not list(lerobot_problems(root))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -219,6 +219,10 @@ def test_a_crash_between_the_renames_is_recovered(
         _crash_in_swap(patch, crash_after)
         with pytest.raises(KeyboardInterrupt):
             committer.commit()
+    assert root.exists() == (crash_after == 2)
+    with pytest.raises(UsageError, match="continue it with --resume") as caught:
+        _commit_once(root)
+    assert "remove that folder" not in str(caught.value)  # it may be the only copy
     _commit_rest(root, episodes)
     assert _tree(root) == whole[6]
 

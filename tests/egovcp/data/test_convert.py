@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -173,3 +174,37 @@ def test_damage_is_named_and_nothing_is_left(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"episode 1, frame 2: observation.state is not finite"):
         _converted(root, tmp_path / "own")
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("key", ["next.reward", "timestamp", "task_index"])
+def test_a_missing_column_is_named(key: str, tmp_path: Path) -> None:
+    features = {k: v for k, v in FEATURES.items() if v["dtype"] != "video"}
+    options = {"fps": 10, "use_videos": False}
+    root = write_features(tmp_path / "a", features, LENGTHS, ("x",), options)
+    path = next((root / "data").rglob("*.parquet"))
+    pq.write_table(pq.read_table(path).drop_columns([key]), path)
+    with pytest.raises(DataError, match=f"parquet, episode 0: column {key} is missing"):
+        _converted(root, tmp_path / "own")
+    info = json.loads((root / "meta/info.json").read_text())
+    del info["features"][key]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises((DataError, UsageError), match=f"feature '?{key}"):
+        _converted(root, tmp_path / "own")
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("damage", ["damaged", "short"])
+def test_damage_of_a_video_names_the_video(damage: str, theirs: Path, tmp_path: Path) -> None:
+    root, key = Path(shutil.copytree(theirs, tmp_path / "theirs")), "observation.images.top"
+    (path,) = (root / "videos" / key).rglob("*.mp4")
+    if damage == "damaged":
+        path.write_bytes(b"no video")
+    else:
+        with av.open(str(path), "w") as target:
+            stream = target.add_stream("mpeg4", rate=10)
+            stream.width, stream.height = 64, 48
+            image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8))
+            for packet in (*stream.encode(image), *stream.encode()):
+                target.mux(packet)
+    with pytest.raises(DataError, match=r"mp4, episode 0.*: (the video is|.* ends after 1 of 7)"):
+        _converted(root, tmp_path / "own", image=key)

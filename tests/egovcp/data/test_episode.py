@@ -1,10 +1,13 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from egovcp.data import Episode
+from egovcp.data.episode import frame_layout
 from egovcp.errors import DataError
+from egovcp.robot_spec import G1
 
 
 def _put(name: str, frame: int, value: object):  # type: ignore[no-untyped-def]
@@ -61,3 +64,13 @@ def test_valid_episodes_pass(episodes: list[Episode]) -> None:
     for episode in episodes:
         episode.validate()
     assert [e.terminated for e in episodes] == [False, True, False, True, False, False]
+
+
+def test_an_episode_whose_depth_the_reader_would_refuse_is_refused() -> None:
+    robot, length = replace(G1, depth=(144, 208)), 17_887
+    arrays: dict[str, Any] = {
+        name: np.broadcast_to(np.zeros((), dtype), (length, *shape))
+        for name, (shape, dtype) in frame_layout(robot).items()
+    }
+    with pytest.raises(DataError, match="17887 frames, expected at most 17886 with depth images"):
+        Episode(**arrays, task="ball", time_limit=length, robot=robot).validate()

@@ -7,6 +7,7 @@ import pytest
 
 from egovcp.data import DatasetReader, EpisodeIndex, describe_heldout
 from egovcp.data import index as index_module
+from egovcp.data.index import SPLITS, in_split
 from egovcp.dataset_options import SelectedDatasetConfig
 
 
@@ -38,6 +39,11 @@ def test_only_selected_episodes_are_in_a_split(
     parts = [EpisodeIndex.of([reader], split) for split in ("train", "heldout")]
     assert sorted(n for part in parts for n in part.number.tolist()) == [1, 2, 5]
     assert len(everything) == 6
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_no_episode_is_in_a_split_of_none(split: str) -> None:
+    assert in_split([], split) == []
 
 
 @pytest.mark.parametrize("chosen", ["0:6", "0:3", "[1, 4]", "2:"])

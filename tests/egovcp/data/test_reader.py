@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
@@ -255,3 +256,12 @@ def test_a_dataset_that_is_replaced_while_it_is_opened_is_opened_again(
 
     monkeypatch.setattr(metadata, "load_episode_table", load_and_replace)
     assert len(open_dataset(copy)) == 7
+
+
+@pytest.mark.parametrize("name", ["task", None])
+def test_the_index_of_the_tasks_need_not_have_a_name(name: str | None, tmp_path: Path) -> None:
+    """LeRobot 0.4 and its conversion of v2.1 datasets give it none."""
+    (tmp_path / "meta").mkdir()
+    frame = pd.DataFrame({"task_index": [0, 1]}, index=pd.Index(["ball", "wall"], name=name))
+    frame.to_parquet(tmp_path / "meta/tasks.parquet")
+    assert metadata.load_tasks(tmp_path) == {0: "ball", 1: "wall"}

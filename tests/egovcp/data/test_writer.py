@@ -1,4 +1,7 @@
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +10,7 @@ import pytest
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
 from egovcp.data.writer import VersionWriter
-from egovcp.errors import DataError, UsageError
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 _ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
 
@@ -118,3 +121,31 @@ def test_a_bad_episode_is_refused_with_its_frame(tmp_path: Path, make_episode: o
     ):
         writer.add(episode)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_of_a_killed_writer_is_removed(tmp_path: Path, episodes: list[Episode]) -> None:
+    code = """
+import os, signal, sys
+from egovcp.data import DatasetWriter, Provenance
+from egovcp.testing import random_episode
+with DatasetWriter(sys.argv[1], Provenance("stance-1")) as writer:
+    writer.add(random_episode(0))
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    killed = subprocess.run([sys.executable, "-c", code, tmp_path / "new"], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 1
+    with DatasetWriter(tmp_path / "new", Provenance("stance-1")) as writer:
+        writer.add(episodes[0])
+    assert [p.name for p in tmp_path.iterdir()] == ["new"]
+
+
+def test_a_second_writer_of_a_dataset_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
+    with DatasetWriter(tmp_path / "new", Provenance("stance-1")) as writer:
+        with (
+            pytest.raises(EnvironmentFailure, match="new is being written by process"),
+            DatasetWriter(tmp_path / "new", Provenance("stance-1")),
+        ):
+            pass
+        writer.add(episodes[0])
+    assert [p.name for p in tmp_path.iterdir()] == ["new"]
