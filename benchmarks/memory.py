@@ -48,7 +48,7 @@ def peak_mb(task: str, episodes: int) -> float:
 
 def main() -> None:
     """Measure and print."""
-    options = parser(__doc__)
+    options = parser(__doc__, rounds=None)
     options.add_argument("--task", default="ball", help="ball, wall or arch")
     options.add_argument("--episodes", type=int, nargs=2, default=[200, 800])
     args = options.parse_args()

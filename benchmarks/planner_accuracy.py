@@ -33,7 +33,7 @@ def states(model: WorldModel, root: str, episodes: int, every: int) -> tuple[Car
     """Filtered states of every ``every``-th row of the last episodes, and the actions before."""
     reader = open_dataset(root)
     carries, before = list[Carry](), []
-    for index in range(len(reader) - episodes, len(reader)):
+    for index in range(max(0, len(reader) - episodes), len(reader)):
         episode = reader.read(index)
         depth = torch.from_numpy(episode.depth.astype(np.int32))
         action = torch.from_numpy(np.vstack([0 * episode.action[:1], episode.action[:-1]])).float()

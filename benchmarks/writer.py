@@ -59,6 +59,8 @@ def lerobot(root: Path, episodes: Sequence[Episode]) -> None:
                     spec.DONE_KEY: e.done[t : t + 1],
                     spec.SUCCESS_KEY: e.success[t : t + 1],
                     spec.TRUNCATED_KEY: e.truncated[t : t + 1],
+                    spec.REWARD_TERMS_KEY: e.reward_terms[t],
+                    spec.OBJECT_KEY: e.object[t],
                     "task": e.task,
                 }
             )

@@ -140,6 +140,8 @@ def _translate(
     network = isinstance(error, (ConnectionError, TimeoutError, LocalEntryNotFoundError))
     if isinstance(error, OSError) and error.errno is not None and not network:
         return error  # the disk
+    if isinstance(chain[-1], (ConnectionError, TimeoutError, RuntimeError)):  # of hf_xet
+        return unreachable(f"{_line(chain[-1])} for {repo_type} {name}")
     return EnvironmentFailure(
         f"the Hub gave no usable answer about {repo_type} {name}: {_line(chain[-1])}; check the "
         "network and HF_ENDPOINT, or try again later"

@@ -1,8 +1,9 @@
 """Time limits and retries for calls of `huggingface_hub`.
 
 The library repeats some requests and not others, waits as long as a server demands, and sets no
-time limit on most of them. Within `call_hub`, every request has a time limit and fails at once, and
-the whole call is repeated after growing pauses.
+time limit on most of them. Within `call_hub`, every request of its HTTP client has a time limit and
+fails at once. Files that are transferred by `hf_xet` keep its time limits and repetitions, which
+may last some minutes. In both cases the whole call is repeated after growing pauses.
 
 The client of `huggingface_hub.get_session` gets another ``send``, which does nothing special
 outside of `call_hub`. A client that the user set with `set_client_factory`, with a proxy or
@@ -49,7 +50,7 @@ class RetryPolicy:
     longest_wait_s: float = bounded(300.0, least=0)
     """Longest pause, s; if the Hub demands a longer one, the request fails."""
     timeout_s: float = bounded(60.0, above=0)
-    """Longest time without data within a request, s."""
+    """Longest time without data within a request, s; `hf_xet` has its own limits."""
 
     def pause(self, attempt: int) -> float:
         """Pause after attempt number ``attempt`` (from 1), s."""

@@ -140,10 +140,11 @@ class AsyncSink:
         end = time.monotonic() + timeout_s
         while self.failure is None and not ready() and (left := end - time.monotonic()) > 0:
             self._process.wait(left)
-            self._pump()
+            self._pump(_KILL_TIMEOUT_S)
 
-    def _pump(self) -> None:
-        """Exchange bytes with the process without blocking."""
+    def _pump(self, exit_wait_s: float = 0.0) -> None:
+        """Exchange bytes with the process without blocking; if it has closed a pipe, wait at most
+        ``exit_wait_s`` for its exit code."""
         assert self._process is not None
         if self.failure is not None or self._closed:
             return
@@ -152,7 +153,7 @@ class AsyncSink:
                 self._handle(report)
         except (EOFError, BrokenPipeError):
             if not self._closed and self.failure is None:
-                self._fail(EnvironmentFailure(self._process.exit_text()))
+                self._fail(EnvironmentFailure(self._process.exit_text(exit_wait_s)))
 
     def _handle(self, report: WriterReport) -> None:
         match report:
@@ -249,9 +250,9 @@ class _WriterProcess:
             poll.register(self._commands, select.POLLOUT)
         poll.poll(min(seconds, 1.0) * 1e3)
 
-    def exit_text(self) -> str:
+    def exit_text(self, wait_s: float) -> str:
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_KILL_TIMEOUT_S)
+            self._process.wait(wait_s)
         code = self._process.poll()
         if code is None:
             return "its writer process closed the pipe"

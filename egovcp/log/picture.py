@@ -71,7 +71,7 @@ class PictureSink:
     def write(self, tick: Tick) -> None:
         """Keep the tick without candidates and later imagined images."""
         images = tick.depth_imagined
-        shown = None if images is None else images[:AHEAD]
+        shown = None if images is None else images[:AHEAD].copy()
         self._ticks.append(replace(tick, candidates=None, depth_imagined=shown))
 
     def close(self) -> None:
@@ -272,8 +272,10 @@ def _write_gif(images: Sequence[Frame], path: Path, dt: float) -> None:
         Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
         for image in images
     ]
-    milliseconds = round(1000 * STRIDE * dt)
-    first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
+    # A GIF counts in steps of 10 ms: rounding the ends of the frames keeps the speed.
+    ends = 10 * np.rint(100 * STRIDE * dt * np.arange(len(images) + 1)).astype(int)
+    durations = np.diff(ends).tolist()
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
 
 
 def _write_mp4(images: Sequence[Frame], path: Path, dt: float) -> None:

@@ -77,7 +77,7 @@ class RerunSink:
         """Start the recording and log static data."""
         self._view, self._robot = info.camera, info.robot
         name = f"{info.task} seed {info.seed} episode {info.episode}"
-        stream = rr.RecordingStream("egovcp", recording_id=name)
+        stream = rr.RecordingStream("egovcp")
         self._planned = info.robot.is_g1 and not self._signals
         layout = blueprint() if self._planned else signals_blueprint(info.robot)
         if isinstance(self._destination, Viewer):

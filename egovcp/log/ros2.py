@@ -188,7 +188,8 @@ def image_16uc1(time_ns: int, frame: str, image: NDArray[np.uint16]) -> bytes:
 
 def camera_info(time_ns: int, frame: str, view: CameraView) -> bytes:
     """``sensor_msgs/CameraInfo`` of an undistorted pinhole."""
-    f, (cx, cy) = view.focal_px, view.centre_px
+    f, (column, row) = view.focal_px, view.centre_px
+    cx, cy = column - 0.5, row - 0.5  # ROS counts from the centre of the first pixel
     cdr = _header(time_ns, frame).u32(DEPTH_ROWS, DEPTH_COLS).string("plumb_bob").f64s([0.0] * 5)
     cdr.f64([f, 0, cx, 0, f, cy, 0, 0, 1]).f64(np.eye(3))
     cdr.f64([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1, 0])

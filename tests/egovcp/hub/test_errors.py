@@ -7,7 +7,7 @@ import pytest
 from huggingface_hub import constants
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub import Publication, RetryPolicy, hub_errors, hub_token, publish
+from egovcp.hub import HubUnreachable, Publication, RetryPolicy, hub_errors, hub_token, publish
 from tests.support.hub import FakeHub
 
 
@@ -39,6 +39,12 @@ def test_a_full_disk_is_not_a_network_error() -> None:
     with pytest.raises(OSError, match="No space left") as caught, hub_errors("me/small"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.errno == errno.ENOSPC
+
+
+def test_an_upload_of_an_unreadable_file_is_not_a_network_error() -> None:
+    with pytest.raises(EnvironmentFailure) as caught, hub_errors("me/small"):
+        raise RuntimeError("Error while uploading") from OSError(errno.EIO, "cannot read")
+    assert not isinstance(caught.value, HubUnreachable)
 
 
 def test_offline_mode_sends_no_request(

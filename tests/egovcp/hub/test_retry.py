@@ -79,6 +79,20 @@ def test_a_refused_connection_is_repeated(
     assert "trying again" in caplog.text
 
 
+@pytest.mark.parametrize("error", [ConnectionError, TimeoutError, RuntimeError])
+def test_a_failed_transfer_by_hf_xet_is_repeated(
+    hub: FakeHub, quick: RetryPolicy, error: type[Exception]
+) -> None:
+    failures = iter([error("CAS Client Error: error sending request")])
+
+    def transfer() -> str:
+        for failure in failures:
+            raise failure
+        return "the file"
+
+    assert call_hub(transfer, quick, "me/small") == "the file"
+
+
 def test_a_call_in_a_forked_child_of_a_call_is_repeated(hub: FakeHub, quick: RetryPolicy) -> None:
     hub.fail("whoami", 503)
 

@@ -20,6 +20,7 @@ from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import RunInfo
+from egovcp.log.writer_process import Outbox
 from tests.support.sinks import FaultySink
 
 INFO = RunInfo("ball")
@@ -156,6 +157,7 @@ def test_a_killed_writer_is_reported_once(
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary"))
     os.kill(sink.pid, signal.SIGKILL)
+    os.waitid(os.P_PID, sink.pid, os.WEXITED | os.WNOWAIT)
     index = 0
     while sink.failure is None:
         sink.write(make_tick(index, bare=True))
@@ -164,6 +166,26 @@ def test_a_killed_writer_is_reported_once(
     sink.write(make_tick(index, bare=True))
     assert warnings == [
         "the log: its writer process ended by signal 9; the run continues without this log"
+    ]
+
+
+def test_write_does_not_wait_for_the_end_of_the_writer(
+    tmp_path: Path,
+    start: Start,
+    make_tick: Any,
+    warnings: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(outbox: Outbox) -> None:
+        raise BrokenPipeError
+
+    sink, tick = start(FaultySink(tmp_path / "diary")), make_tick(0, bare=True)
+    monkeypatch.setattr(Outbox, "pump", broken)
+    begin = time.monotonic()
+    sink.write(tick)
+    assert time.monotonic() - begin < 0.5
+    assert warnings == [
+        "the log: its writer process closed the pipe; the run continues without this log"
     ]
 
 

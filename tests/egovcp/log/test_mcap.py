@@ -20,6 +20,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.messages import Topic, motor_readings
 from egovcp.log.tick import CameraView, RunInfo, Tick
+from egovcp.robot.geometry import pixel_rays
 from egovcp.robot.kinematics import LINK_NAMES
 
 ROOT = Path(__file__).parents[3]
@@ -123,6 +124,11 @@ def test_a_standard_ros_decoder_reads_every_message(tmp_path: Path, make_tick: A
     assert pelvis.translation.z == pytest.approx(0.7)
     camera = decoded[Topic.CAMERA_INFO]
     assert 2 * np.arctan(24 / camera.k[4]) == pytest.approx(INFO.camera.vertical_fov)
+    forward, left, up = pixel_rays(INFO.camera.focal_px).T
+    row, column = np.mgrid[:48, :64]
+    for matrix in (np.reshape(camera.k, (3, 3)), np.reshape(camera.p, (3, 4))[:, :3]):
+        pixels = matrix @ np.stack([-left, -up, forward])  # right, down and forward
+        np.testing.assert_allclose(pixels[:2], (column.ravel(), row.ravel()), atol=1e-9)
     assert decoded[Topic.LOG].msg == "ball thrown\nsecond line"
     assert [f.name for f in decoded[Topic.CANDIDATES].fields] == ["x", "y", "z", "value"]
 

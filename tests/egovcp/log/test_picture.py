@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.log import picture
 from egovcp.log.picture import (
     AHEAD,
     SIZE,
@@ -23,6 +25,7 @@ from egovcp.log.picture import (
     key_frames,
     rollout_picture,
     video_frames,
+    write_videos,
 )
 from egovcp.log.scene_plot import scene_faces, view_offset
 from egovcp.log.tick import RunInfo
@@ -97,6 +100,15 @@ def test_close_writes_the_picture(tmp_path: Path, make_tick: Any, bare: bool) ->
         assert len(image.convert("L").getcolors()) > 20
 
 
+def test_only_the_shown_imagined_images_are_kept(make_tick: Any) -> None:
+    images = np.zeros((2 * AHEAD, 48, 64))
+    kept = weakref.ref(images)
+    sink = PictureSink()
+    sink.write(replace(make_tick(0, bare=True), depth_imagined=images))
+    del images
+    assert kept() is None
+
+
 def test_a_picture_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"precious")
     with pytest.raises(EnvironmentFailure, match="exists already"):
@@ -145,6 +157,20 @@ def test_a_gif_has_one_frame_per_stride(tmp_path: Path, make_tick: Any, bare: bo
         assert image.size == SIZE
         assert image.info["duration"] == 80
         assert 1 < image.n_frames <= 3  # type: ignore[attr-defined]
+
+
+def test_a_gif_has_the_speed_of_the_robot(
+    tmp_path: Path, make_tick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.gif"
+    steps = (np.full((8, 8, 3), 20 * i, np.uint8) for i in range(9))
+    monkeypatch.setattr(picture, "video_frames", lambda ticks, robot: steps)
+    write_videos([], [path], replace(G1, planner_hz=30))
+    durations = []
+    with Image.open(path) as image:
+        for frame in ImageSequence.Iterator(image):
+            durations.append(frame.info["duration"])
+    assert durations == [70, 60, 70] * 3
 
 
 def test_an_mp4_has_the_same_frames(tmp_path: Path, make_tick: Any) -> None:

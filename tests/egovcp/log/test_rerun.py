@@ -97,6 +97,14 @@ def test_without_meshes_the_robot_is_a_skeleton(tmp_path: Path, make_tick: Any) 
     assert len(strips) == len(LINK_NAMES) - 1 + 2
 
 
+def test_recordings_of_the_same_episode_have_different_ids(tmp_path: Path, make_tick: Any) -> None:
+    recordings = []
+    for name in ("a.rrd", "b.rrd"):
+        record(tmp_path / name, [make_tick(0, bare=True)], meshes=False)
+        recordings += RrdReader(tmp_path / name).recordings()
+    assert len({recording.recording_id for recording in recordings}) == 2
+
+
 def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "a.rrd"
     path.write_bytes(b"precious")
