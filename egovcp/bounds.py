@@ -61,10 +61,15 @@ class Bounds:
             "at most": self.most,
             "less than": self.below,
         }
-        said = [f"{word} {value:g}" for word, value in words.items() if value is not None]
+        said = [f"{word} {_exact(value)}" for word, value in words.items() if value is not None]
         if self.per_core is not None:
             said.append(f"at most {self.per_core} per processor core")
         return " and ".join(said) or _FINITE
+
+
+def _exact(value: float) -> str:
+    """1048576, not 1.04858e+06."""
+    return str(int(value)) if value == int(value) else f"{value:g}"
 
 
 _ANY: Final = Bounds()

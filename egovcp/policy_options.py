@@ -43,7 +43,7 @@ class PlannerOptions:
     samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""
     horizon: int | None = bounded(None, least=1, most=1000)
-    """N, planning horizon, steps of 40 ms."""
+    """N, planning horizon, planner steps (of 40 ms for the G1)."""
     objective: Objective | None = None
     """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward."""

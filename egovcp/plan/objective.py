@@ -110,7 +110,9 @@ class ReturnAccumulator:
     """Accumulates J of plans step by step, and selects the head that each step needs.
 
     A failed plan has the value ``floor``, or the reward (1 - gamma) floor at each step, whose
-    discounted sum is the floor. So a failure at step j contributes gamma^j floor for any horizon.
+    endless discounted sum is the floor. So under ``td`` a failure at step j contributes
+    gamma^j floor for any horizon N; under ``reward``, which ends with the plan, it contributes
+    (gamma^j - gamma^N) floor.
 
     Args:
         config: objective and termination rule.

@@ -23,8 +23,8 @@ from egovcp.robot_spec import G1, RobotSpec
 type Array = NDArray[np.float32]
 
 LARGEST_STATE: Final = 1e3
-"""Bound of all quantities of the proprioception, in the units of `spec.STATE_SLICES`."""
-
+"""Bound of all quantities of the G1's proprioception, in the units of `spec.STATE_SLICES`."""
+_LARGEST_FLOAT: Final = float(np.finfo(np.float32).max)
 
 _NONE: Final[Array] = np.zeros(0, np.float32)
 
@@ -45,8 +45,8 @@ class PolicyStep(NamedTuple):
 class Policy:
     """Filters observations and plans for E robots; call `act`, then `advance`, once per step.
 
-    If a robot's state is not finite or exceeds `LARGEST_STATE`, its observation is skipped and the
-    prior predicts this step. Depth that is not finite counts as invalid (0).
+    If a robot's state is not finite, or that of a G1 exceeds `LARGEST_STATE`, its observation is
+    skipped and the prior predicts this step. Depth that is not finite counts as invalid (0).
 
     The recurrence advances with the action that was sent, after the safety layer: pass it to
     `advance`. The model's weights are packed at the first plan; later changes are not seen. Shapes
@@ -63,6 +63,7 @@ class Policy:
         self.config = config
         self.num_envs = num_envs
         self._views = 2 if config.mirror and model.robot.mirror else 1
+        self._largest_state = LARGEST_STATE if model.robot.is_g1 else _LARGEST_FLOAT
         self._seed = seed
         self._evaluator: PlanEvaluator[Carry] | None = None
         self.skipped: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
@@ -70,21 +71,15 @@ class Policy:
         self.reset()
 
     @torch.inference_mode()
-    def reset(self, rows: NDArray[np.intp] | None = None) -> None:
-        """Reset ``rows`` (None: all, and the random generator)."""
-        if rows is None:
-            device, envs = self._device, self.num_envs
-            actions = self.model.robot.action_dim
-            self._carry = self.model.initial(self._views * envs)  # the mirrored states follow
-            self._sent = torch.zeros(envs, actions, device=device)
-            self._first = torch.ones(envs, dtype=torch.bool, device=device)
-            self._warm = torch.zeros(envs, self.config.actions, actions, device=device)
-            self._generator = torch.Generator(device).manual_seed(self._seed)
-            return
-        index = torch.as_tensor(rows, device=self._device)
-        self._first[index] = True
-        self._sent[index] = 0.0
-        self._warm[index] = 0.0
+    def reset(self) -> None:
+        """Reset all robots and the random generator."""
+        device, envs = self._device, self.num_envs
+        actions = self.model.robot.action_dim
+        self._carry = self.model.initial(self._views * envs)  # the mirrored states follow
+        self._sent = torch.zeros(envs, actions, device=device)
+        self._first = torch.ones(envs, dtype=torch.bool, device=device)
+        self._warm = torch.zeros(envs, self.config.actions, actions, device=device)
+        self._generator = torch.Generator(device).manual_seed(self._seed)
 
     @torch.inference_mode()
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
@@ -96,7 +91,7 @@ class Policy:
         self._check_shapes(depth, state)
         if np.issubdtype(depth.dtype, np.floating):
             depth = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
-        valid = (np.abs(state) <= LARGEST_STATE).all(1)  # false for NaN
+        valid = (np.abs(state) <= self._largest_state).all(1)  # false for NaN and infinity
         depth = depth.astype(np.int32)
         state = np.where(valid[:, None], state, 0.0).astype(np.float32)
         if self._views > 1:
@@ -169,6 +164,7 @@ class Policy:
             self._generator,
             self._warm,
             remaining,
+            self.model.discount,
         )
         self._warm = shift(plan.deltas)
         return PolicyStep(

@@ -100,6 +100,7 @@ def make_plan[C](
     generator: torch.Generator,
     warm: Tensor | None = None,
     remaining: Callable[[], float] | None = None,
+    discount: Tensor | float = spec.GAMMA,
 ) -> Plan:
     """Plan for E robots from ``carry`` (E, ...), a_{t-1} = ``executed`` (E, 7).
 
@@ -112,6 +113,7 @@ def make_plan[C](
             other robots.
         remaining: seconds until the result is due. The search stops if another iteration, as long
             as the slowest so far, would end later, but does at least one.
+        discount: discount per step of the costs, that of the model's Q.
     """
     left = remaining() if remaining else 0.0
     slowest = 0.0
@@ -124,7 +126,8 @@ def make_plan[C](
         if config.action_parameterization == "target":
             deltas = target_deltas(start, deltas, config.eta)
         actions = walk(start, deltas, config.eta)
-        values = plan_value(actions, generator) - action_costs(start, actions, config)
+        costs = action_costs(start, actions, config, discount)
+        values = plan_value(actions, generator) - costs
         values = values.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         state = optimiser.update(state, deltas, values)
         if remaining:
@@ -137,22 +140,24 @@ def make_plan[C](
     return Plan(chosen, state.mean, state.value, best, state.values, iteration + 1)
 
 
-def action_costs(start: Tensor, actions: Tensor, config: PlannerConfig) -> Tensor:
+def action_costs(
+    start: Tensor, actions: Tensor, config: PlannerConfig, discount: Tensor | float
+) -> Tensor:
     """Discounted costs (E, M) of poses and action changes in plans (E, M, config.actions, 7), of
     which the first N count, from a_{t-1} (E, 1, 7):
 
     sum_{k<K} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
 
-    K is the horizon N. Under ``objective=value`` it is `spec.RETURN_STEPS` if that is more, because
-    Q also counts later rewards: after the plan the last action is held.
+    gamma is ``discount``, K the horizon N. Under ``objective=value`` K is `spec.RETURN_STEPS` if
+    that is more, because Q also counts later rewards: after the plan the last action is held.
     """
     actions = actions[..., : config.horizon, :]
     before = torch.cat([start[:, None].expand_as(actions[..., :1, :]), actions[..., :-1, :]], -2)
     change = (actions - before) / spec.ACTION_RATE_LIMIT
     pose = config.pose_cost * actions.square().mean(-1)
     steps = max(config.horizon, spec.RETURN_STEPS if config.objective == "value" else 0)
-    discount = spec.GAMMA ** torch.arange(steps, device=actions.device)
-    during, after = discount[: config.horizon], discount[config.horizon :].sum()
+    weight = discount ** torch.arange(steps, device=actions.device)
+    during, after = weight[: config.horizon], weight[config.horizon :].sum()
     rate = config.action_rate_cost * change.square().mean(-1)
     return ((pose + rate) * during).sum(-1) + pose[..., -1] * after
 

@@ -55,6 +55,10 @@ class Boat:
     """Further sails."""
 
 
+def test_integers_are_exact() -> None:
+    assert str(Bounds(least=1e-4, most=2**20)) == "at least 0.0001 and at most 1048576"
+
+
 def _parse(*argv: str) -> Boat:
     return parse_config(Boat, argv, "egovcp-test")
 

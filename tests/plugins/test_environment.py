@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from lerobot.scripts.lerobot_eval import rollout
 from egovcp import spec
 from egovcp.artifact import load_artifact
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.robot_spec import G1
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.gym import EgovcpEnv
-from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotEgovcpEnv
+from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotEgovcpEnv, configuration_egovcp
 
 TICKS = 8
 SIMULATION = EnvConfig(controller="stance", ball_episode=EpisodeConfig(TICKS, (2, 3)))
@@ -151,6 +153,13 @@ def test_async_environments_work() -> None:
         assert env.call("_max_episode_steps") == (TICKS, TICKS)
     finally:
         close_envs(envs)
+
+
+def test_a_task_of_another_robot_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = SimpleNamespace(robot_spec=lambda: replace(G1, robot_type="planar_arm"))
+    monkeypatch.setattr(configuration_egovcp, "find_task", lambda *_: task)
+    with pytest.raises(UsageError, match=r"--env\.task=reach is of robot planar_arm"):
+        EgovcpEnvConfig(task="reach")
 
 
 @pytest.mark.parametrize(

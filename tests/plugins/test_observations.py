@@ -153,6 +153,20 @@ def test_a_refused_observation_does_not_change_the_policy(
     assert torch.equal(policy.select_action(batch), expected)
 
 
+def test_a_covered_camera_is_refused_in_the_first_image_only(
+    artifact: Path, depth: Tensor, state: Tensor
+) -> None:
+    policy = EgovcpPolicy.from_pretrained(artifact)
+    covered = {spec.DEPTH_KEY: torch.full_like(depth, 200.0), spec.STATE_KEY: state}
+    with pytest.raises(DataError, match="not metres"):
+        policy.select_action(covered)
+    policy.select_action({spec.DEPTH_KEY: depth, spec.STATE_KEY: state})
+    policy.select_action(covered)
+    policy.reset()
+    with pytest.raises(DataError, match="not metres"):
+        policy.select_action(covered)
+
+
 def test_a_state_that_is_not_finite_is_skipped_with_one_warning(
     artifact: Path, depth: Tensor, state: Tensor, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -13,13 +13,14 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy
 from torch import Tensor
 
-from egovcp.artifact import load_artifact
-from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
+from egovcp.artifact import load_artifact, returns_of
+from egovcp.data import DatasetReader, DatasetWriter, EpisodeStore, Provenance, ReturnConfig
 from egovcp.data.samplers import gather
 from egovcp.data.store import mirror_windows
 from egovcp.errors import ArtifactError, DataError, UsageError
 from egovcp.model import Batch
 from egovcp.robot.stance import StanceController
+from egovcp.testing import random_episode
 from egovcp_train.datasets import set_normalisation
 from lerobot_policy_egovcp import (
     EgovcpConfig,
@@ -161,6 +162,7 @@ def test_what_is_saved_is_an_artifact(
     loaded = load_artifact(str(tmp_path))
     assert loaded.controller_id == StanceController().id
     assert loaded.manifest["datasets"] == [{"repo_id": "me/ball", "revision": ""}]
+    assert returns_of(loaded) == policy.config.returns
     assert loaded.planner == policy.config.planner
     for name, value in policy.world_model.state_dict().items():
         assert torch.equal(loaded.world_model.state_dict()[name], value), name
@@ -186,6 +188,23 @@ def test_an_artifact_of_egovcp_train_can_be_trained_further(
     assert policy.world_model.gru.project.parts[0].weight.grad.abs().max() > 0
     for name, value in policy.world_model.named_buffers():
         assert torch.equal(value, statistics[name]), name
+
+
+def test_rows_of_files_that_were_not_downloaded_are_not_valid(tmp_path: Path) -> None:
+    """Of --dataset.episodes, LeRobot downloads only the files."""
+    root, config = tmp_path / "dataset", ReturnConfig(steps=4)
+    with DatasetWriter(root, Provenance(StanceController().id, seed=0), 2) as writer:
+        for number in range(4):
+            writer.add(random_episode(number))
+    reader = open_reader(root, "me/ball")
+    complete = RowTargets.of(reader, config)
+    reader.data_path(0).unlink()
+    found = RowTargets.of(open_reader(root, "me/ball"), config)
+    for name, values in vars(found).items():
+        assert values.shape == getattr(complete, name).shape
+        assert values.dtype == getattr(complete, name).dtype
+        assert not values[:24].any()
+        assert torch.equal(values[24:], getattr(complete, name)[24:])
 
 
 # --- refusals -----------------------------------------------------------------------------

@@ -1,10 +1,11 @@
-"""Freed memory is reused without page faults."""
+"""The device of a run, and freed memory, which is reused without page faults."""
 
 import subprocess
 import sys
 
 import pytest
 
+from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp_train import device
 
 PROGRAM = """
@@ -21,6 +22,16 @@ for _ in range(10):
     np.ones(1_000_000)
 print(faults() - before)
 """
+
+
+@pytest.mark.parametrize("name", ["meta", "hpu"])
+def test_a_device_that_cannot_be_used_is_refused(name: str) -> None:
+    with pytest.raises(
+        EnvironmentFailure, match=rf"--device={name} cannot be used \(.*--device=cpu"
+    ):
+        device.choose_device(name)
+    with pytest.raises(UsageError, match="unknown --device"):
+        device.choose_device("abacus")
 
 
 def _faults() -> int:

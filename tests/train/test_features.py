@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,6 +46,41 @@ def test_trains_and_resumes(theirs: Path, arguments: Arguments, tmp_path: Path) 
     assert len(open_dataset(run / "dataset")) == 6
     again = arguments(tmp_path / "again", dataset__root=run / "dataset")
     assert main(again) == 0
+
+
+def test_the_output_folder_may_be_in_the_home_folder(
+    theirs: Path, arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments(Path("~/run"), NAMES, dataset__root=theirs, steps=1)) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert len(open_dataset(tmp_path / "run" / "dataset")) == 6
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("where", ["egovcp.data.convert._episode", "egovcp_train.train.prepare"])
+def test_a_signal_before_the_first_step_leaves_no_dataset(
+    where: str,
+    number: int,
+    theirs: Path,
+    arguments: Arguments,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def unhandled(*_: object) -> None:
+        pytest.fail("SIGTERM would end the process")
+
+    monkeypatch.setattr(where, lambda *_: signal.raise_signal(number))
+    previous = signal.signal(signal.SIGTERM, unhandled)
+    try:
+        assert main(arguments(tmp_path / "run", NAMES, dataset__root=theirs)) == 130
+        assert signal.getsignal(signal.SIGTERM) is unhandled
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert "egovcp-train: interrupted" in capsys.readouterr().err
+    assert not list((tmp_path / "run").iterdir())
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,16 @@ def test_a_budget_of_steps_ignores_the_clock() -> None:
     assert [budget.progress(step) for step in (0, 50, 200, 300)] == [0.0, 0.25, 1.0, 1.0]
 
 
+def test_progress_begins_after_the_fit_of_the_critic() -> None:
+    clock = _Clock()
+    budget = Budget(200, 2.0, clock, spent=40.0, fit_seconds=30.0)
+    assert budget.progress(0) == pytest.approx(10 / 90)
+    assert budget.progress(50) == pytest.approx(0.25)
+    clock.now += 80.0
+    assert budget.progress(10) == 1.0
+    assert Budget(200, 2.0, clock, spent=150.0, fit_seconds=150.0).progress(0) == 1.0
+
+
 def test_a_budget_of_minutes_ends_with_whichever_comes_first() -> None:
     clock = _Clock()
     budget = Budget(200, 2.0, clock)

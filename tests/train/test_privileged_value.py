@@ -2,11 +2,13 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
 from egovcp import spec
 from egovcp.data import EpisodeIndex, EpisodeStore, open_dataset
@@ -86,7 +88,8 @@ def test_next_actions_are_those_of_the_planner() -> None:
     returns = -actions[..., 6]
 
     def chosen(planner: PlannerConfig) -> torch.Tensor:
-        best = Critic(PrivilegedValue(3), planner, lr=1e-3)._best(returns, actions, previous)
+        critic = Critic(PrivilegedValue(3), planner, lr=1e-3)
+        best = critic._best(returns, actions, previous, torch.tensor(0.97))
         return actions[torch.arange(40), best]
 
     free = chosen(PlannerConfig(pose_cost=0.0, action_rate_cost=0.0))
@@ -173,6 +176,23 @@ def test_the_time_limit_ends_the_fit(store: EpisodeStore) -> None:
     assert critic.state_dict()["updates"] == 5
 
 
+def test_a_fit_without_progress_bar_ends(
+    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with TQDM_DISABLE=1."""
+    monkeypatch.setattr(privileged_value, "tqdm", partial(tqdm, disable=True))
+    seen: list[int] = []
+
+    def progress(updates: int) -> float:
+        seen.append(updates)
+        assert len(seen) < 10, "endless"
+        return updates / 3
+
+    config = PrivilegedValueConfig(updates=3, rows=16)
+    privileged_value.fit(_model(), store, config, _PLANNER, 0, progress)
+    assert seen == [0, 1, 2, 3]
+
+
 def test_equal_seeds_give_equal_values_and_leave_the_random_state(store: EpisodeStore) -> None:
     model, config = _model(0.9), PrivilegedValueConfig(updates=3, rows=16)
     torch.manual_seed(5)
@@ -206,14 +226,41 @@ def test_rows_are_followed_by_their_next_row_and_half_are_mirrored(store: Episod
     assert not np.isin(index.numpy(), store.start + store.length - 1).any()
 
 
-def test_every_dataset_must_know_its_objects(store: EpisodeStore) -> None:
+@pytest.mark.parametrize("mirror", [True, False])
+def test_rows_are_mirrored_where_windows_are(
+    mirror: bool,
+    store: EpisodeStore,
+    arguments: Arguments,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = Transitions(_model(), store, mirror)
+    assert (rows.mirrored is rows.inputs) == (not mirror)
+    made: list[bool] = []
+
+    def record(model: WorldModel, store: EpisodeStore, mirror: bool) -> Transitions:
+        made.append(mirror)
+        return Transitions(model, store, mirror)
+
+    monkeypatch.setattr(privileged_value, "Transitions", record)
+    assert main(arguments(tmp_path / "run", steps=1, sampling__mirror=mirror)) == 0
+    assert made == [mirror]
+
+
+def test_every_task_of_every_dataset_must_know_its_objects(store: EpisodeStore) -> None:
     known = store.privileged[:, spec.OBJECT_KNOWN]
     known[:] = 0.0
     assert not privileged_value.has_objects(store)
     known[0] = 1.0
     assert privileged_value.has_objects(store)
-    dataset = np.arange(len(store.length)) % 2
-    assert not privileged_value.has_objects(dataclasses.replace(store, dataset=dataset))
+    count = len(store.length)
+    others = {"dataset": np.arange(count) % 2, "tasks": ("ball", "wall") * (count // 2)}
+    for name, value in others.items():
+        other = dataclasses.replace(store, **{name: value})  # type: ignore[arg-type]
+        assert not privileged_value.has_objects(other)
+        known[store.start[1]] = 1.0
+        assert privileged_value.has_objects(other)
+        known[store.start[1]] = 0.0
 
 
 @pytest.mark.parametrize("mode", ["ram", "stream"])
@@ -236,14 +283,20 @@ def test_other_targets_do_without(q_target: str, arguments: Arguments, tmp_path:
     assert load_training_state(tmp_path / "run")["learner"]["critic"] is None
 
 
-def test_data_without_objects_falls_back_to_returns(
+@pytest.mark.parametrize("mode", ["ram", "stream"])
+def test_training_data_without_objects_falls_back_to_returns(
+    mode: str,
     arguments: Arguments,
+    dataset_root: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(privileged_value, "has_objects", lambda store: False)
-    assert main(arguments(tmp_path / "run", steps=2)) == 0
-    said = "not every dataset has positions of objects: Q is fitted to returns"
+    asked: list[EpisodeStore] = []
+    monkeypatch.setattr(privileged_value, "has_objects", asked.append)
+    assert main(arguments(tmp_path / "run", steps=2, loading__mode=mode)) == 0
+    said = "not every task of each dataset has positions of objects: Q is fitted to returns"
     assert said in capsys.readouterr().out
+    assert asked[0].identities == EpisodeIndex.of([open_dataset(dataset_root)], "train").identities
+    assert (len(asked[0].depth) > 0) == (mode == "ram")
     assert load_training_state(tmp_path / "run")["learner"]["critic"] is None

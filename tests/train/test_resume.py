@@ -43,7 +43,8 @@ def _stop_after(monkeypatch: pytest.MonkeyPatch, step: int, number: int) -> None
 
 def _state(output: Path) -> dict[str, Any]:
     """What the checkpoint holds, without how long it took to get there."""
-    return {k: v for k, v in load_training_state(output).items() if k != "seconds"}
+    times = ("seconds", "fit_seconds")
+    return {k: v for k, v in load_training_state(output).items() if k not in times}
 
 
 def _equal(a: object, b: object) -> bool:
@@ -193,8 +194,8 @@ def test_a_second_signal_is_obeyed_at_once(
 def test_a_resumed_run_has_the_minutes_that_were_left(
     arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The fit of the privileged value counts, 30 s here."""
-    now = [0.0]
+    """The fit of the privileged value, 30 s here, counts, but progress begins after it."""
+    now, progress_seen = [0.0], list[float]()
     monkeypatch.setattr("egovcp_train.train.Budget", partial(Budget, clock=lambda: now[0]))
     update, fit = Learner.update, privileged_value.fit
 
@@ -206,6 +207,7 @@ def test_a_resumed_run_has_the_minutes_that_were_left(
 
     def slow(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:
         now[0] += 60.0
+        progress_seen.append(progress)
         return update(self, batch, progress)
 
     monkeypatch.setattr(Learner, "update", slow)
@@ -218,6 +220,18 @@ def test_a_resumed_run_has_the_minutes_that_were_left(
     now[0] += 3600.0  # a pause is no training
     assert main([f"--output_dir={output}", "--resume"]) == 0
     assert _state(output)["learner"]["step"] == 5
+    assert progress_seen == pytest.approx([60 * step / 270 for step in range(5)])
+
+
+def test_a_checkpoint_without_the_time_of_the_fit_is_resumed(
+    finished: Path, tmp_path: Path
+) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    state = load_training_state(output)
+    del state["fit_seconds"]
+    _replace_state(output, state)
+    assert main([f"--output_dir={output}", "--resume", "--steps=7"]) == 0
+    assert load_training_state(output)["fit_seconds"] == 0.0
 
 
 def test_a_finished_run_can_be_extended(finished: Path, tmp_path: Path) -> None:
@@ -248,6 +262,27 @@ def test_resume_takes_the_stored_options_for_every_boolean(tmp_path: Path, flag:
     assert checkpoint.resumed_options(TrainConfig, [*argv, "--resume=off"]) == {}
     with pytest.raises(UsageError, match=r"--resume=2: expected bool"):
         checkpoint.resumed_options(TrainConfig, [*argv, "--resume=2"])
+
+
+def test_resume_finds_the_options_in_the_home_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / checkpoint.CONFIG_FILE).write_text("output_dir: run\nsteps: 123\n")
+    assert checkpoint.resumed_options(TrainConfig, ["--output_dir=~", "--resume=true"])["steps"]
+
+
+def test_a_full_device_is_an_environment_failure(
+    arguments: Arguments,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(Learner, "update", fail)
+    _refused(arguments(tmp_path / "run"), 5, capsys, "(CUDA out of memory); lower --batch_size")
 
 
 def test_a_full_memory_is_not_reported_as_a_wrong_option(tmp_path: Path) -> None:
@@ -292,6 +327,9 @@ def test_a_damaged_checkpoint_is_named(
         ("--policy.hidden=48", 4, "does not fit the options"),
         ("--sampling.length=5", 2, "length 6 -> 5"),
         ("--dataset.root=/absent", 3, "no dataset at /absent"),
+        ("--preset=paper", 2, "preset debug, and --preset=paper would change nothing"),
+        ("--returns.gamma=0.9", 2, "--returns.gamma=0.9, but the Q of the run in"),
+        ("--returns.scale=none", 2, "was trained with dataset"),
     ],
 )
 def test_resuming_with_what_does_not_fit_is_refused(

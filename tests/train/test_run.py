@@ -22,7 +22,8 @@ from egovcp.entry_point import prepare_process
 from egovcp.errors import UsageError
 from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS as MODELS
-from egovcp.model import Batch
+from egovcp.model import Batch, world_model_loss
+from egovcp.testing import random_batch, toy_model
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import ABLATIONS, PRESETS, TrainConfig
 from egovcp_train.device import choose_bf16
@@ -446,6 +447,27 @@ def test_a_run_starts_from_the_weights_and_the_normalisation_of_a_policy(
     after = load_artifact(str(_last(tmp_path / "second") / "pretrained_model"))
     for name, value in after.world_model.state_dict().items():
         torch.testing.assert_close(value, before[name], msg=name)
+
+
+@pytest.mark.parametrize(
+    ("flag", "found"), [("--returns.gamma=0.9", "0.97"), ("--returns.scale=none", "dataset")]
+)
+def test_a_policy_of_another_return_is_refused(
+    flag: str, found: str, tmp_path: Path, arguments: Arguments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments(tmp_path / "first", steps=1)) == 0
+    first = _last(tmp_path / "first") / "pretrained_model"
+    assert main(arguments(tmp_path / "second", flag, policy__pretrained_path=first)) == 2
+    message = capsys.readouterr().err
+    assert f"{flag}, but the Q of --policy.pretrained_path={first} was trained with" in message
+    assert f"give {flag.partition('=')[0]}={found}" in message
+
+
+def test_without_multistep_losses_no_state_is_imagined_ahead() -> None:
+    loss = PRESETS["no_multistep"]().policy.loss
+    model = toy_model(dataclasses.replace(MODELS["debug"], loss=loss))
+    _, terms = world_model_loss(model, random_batch(2, 14))
+    assert not [name for name in terms if "multistep" in name]
 
 
 def test_a_policy_of_other_networks_is_refused(

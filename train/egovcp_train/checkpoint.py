@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
@@ -20,6 +20,7 @@ import torch
 
 from egovcp.artifact import load_artifact
 from egovcp.cli import given_options
+from egovcp.data import ReturnConfig
 from egovcp.data.dataset_files import sync, sync_tree
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.files import UnsafeFileError, open_regular, read_text, removed_on_error, sha256
@@ -48,7 +49,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
         argv: its flags, ``--name=value`` each.
 
     Raises:
-        UsageError: ``--resume`` is not a boolean, or a config file is given as well.
+        UsageError: ``--resume`` is not a boolean, or a config file or another preset is given.
         ArtifactError: the stored options cannot be read, or are not those of ``config_class``.
     """
     given = given_options(argv)
@@ -59,7 +60,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
             f"--resume uses the options stored in --output_dir, and "
             f"--config_path={given['config_path']} gives others; drop it, and give changes as flags"
         )
-    saved = Path(given.get("output_dir", "")) / CONFIG_FILE
+    saved = Path(os.path.expanduser(given.get("output_dir", ""))) / CONFIG_FILE
     if not os.path.lexists(saved):
         return {}
     try:
@@ -73,6 +74,12 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
         ) from error
     except (UsageError, ValueError) as error:
         raise ArtifactError(f"{saved}: {error}; {_REMEDY}") from error
+    preset, stored = given.get("preset"), options.get("preset")
+    if preset not in (None, stored):
+        raise UsageError(
+            f"--resume uses the options stored in --output_dir, which are of preset {stored}, and "
+            f"--preset={preset} would change nothing; drop it, or start a new run"
+        )
     return options
 
 
@@ -204,14 +211,17 @@ def _load(file: IO[bytes]) -> dict[str, Any]:
     return state
 
 
-def pretrained_weights(model: WorldModel, path: str) -> dict[str, torch.Tensor]:
-    """State of ``model`` with the weights and the normalisation of a saved policy.
+def pretrained_weights(
+    model: WorldModel, path: str, returns: ReturnConfig
+) -> dict[str, torch.Tensor]:
+    """State of ``model`` with the weights, the normalisation and the discount of a saved policy.
 
     A policy has no decoder of the object's state; that of ``model`` stays.
 
     Raises:
         ArtifactError: the policy cannot be loaded.
-        UsageError: its networks are not those of ``model``.
+        UsageError: its networks are not those of ``model``, or its Q has another discount or scale
+            than ``returns``.
     """
     own, found = model.state_dict(), load_artifact(path).world_model.state_dict()
     missing = {name for name in own.keys() - found.keys() if not name.startswith("object_head.")}
@@ -222,4 +232,28 @@ def pretrained_weights(model: WorldModel, path: str) -> dict[str, torch.Tensor]:
             f"--policy.pretrained_path={path}: its networks are not those of --policy "
             f"({', '.join(sorted(differing)[:3])}); give the options that it was trained with"
         )
+    require_same_returns(found, returns, f"--policy.pretrained_path={path}")
     return own | found
+
+
+def require_same_returns(
+    state: Mapping[str, torch.Tensor], returns: ReturnConfig, where: str
+) -> None:
+    """Raise `UsageError` unless the Q of a model that is trained on has the options' discount and
+    scale, which are part of its state.
+
+    Args:
+        state: `WorldModel.state_dict` of the model.
+        where: what the model comes from, for the message.
+    """
+    is_scaled = bool(state["return_mean"] != 0 or state["return_std"] != 1)
+    options = {
+        "gamma": (f"{returns.gamma:.6g}", f"{float(state['discount']):.6g}"),
+        "scale": (returns.scale, "dataset" if is_scaled else "none"),
+    }
+    for name, (given, found) in options.items():
+        if given != found:
+            raise UsageError(
+                f"--returns.{name}={given}, but the Q of {where} was trained with {found}; give "
+                f"--returns.{name}={found}, or start a new run without its weights"
+            )

@@ -285,7 +285,7 @@ _ABLATED_LOSSES: Final[Mapping[str, Mapping[str, Any]]] = {
     "state_summed": {"state": float(spec.STATE_DIM)},
     "state_1": {"state": 1.0, "multistep_state": 1.0},
     "no_moving": {"motion_weight": 0.0},
-    "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
+    "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0, "multistep_object": 0.0},
     "no_near": {"proximity_weight": 0.0},
     "no_object": {"object": 0.0, "multistep_object": 0.0},
     "no_sampled_actions": {"sampled_actions": 0},

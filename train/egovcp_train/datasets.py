@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +33,7 @@ from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root, locate
 from egovcp.dataset_options import DatasetConfig, SelectedDatasetConfig
 from egovcp.errors import DataError, UsageError
-from egovcp.hardware import available_bytes
+from egovcp.hardware import available_bytes, require_memory
 from egovcp.model import Batch, WorldModel
 from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
@@ -45,6 +46,7 @@ FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
 )
 """Bytes per frame of the G1, an estimate for other robots."""
 
+_BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _RETURNS: Final = ReturnConfig()
 
 type Built = tuple[PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore]]
@@ -85,6 +87,14 @@ def check_options(config: TrainConfig) -> None:
     config.returns.check()
 
 
+def require_batch_memory(config: TrainConfig, device: torch.device) -> None:
+    """Raise `UsageError` for a batch that is too large for this machine."""
+    size, length = config.batch_size, config.sampling.length
+    option = f"--batch_size={size} with --sampling.length={length}"
+    copies = _BATCH_COPIES if device.type == "cpu" else 1
+    require_memory(option, size * length * copies * FRAME_BYTES)
+
+
 def prepare(
     config: TrainConfig, readers: tuple[DatasetReader, ...], model: WorldModel
 ) -> TrainingData:
@@ -122,7 +132,7 @@ def convert_if_needed(config: TrainConfig) -> TrainConfig:
     """
     if not config.features:
         return config
-    root = Path(config.output_dir).absolute() / "dataset"
+    root = Path(os.path.expanduser(config.output_dir)).absolute() / "dataset"
     source = locate(config.dataset, config.loading.network)
     convert_dataset(source, config.features, root, config.dataset.episodes)
     dataset = SelectedDatasetConfig(repo_id=config.dataset.repo_id, root=str(root))

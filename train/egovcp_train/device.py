@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +22,7 @@ def choose_device(name: str) -> torch.device:
     """The device that ``--device`` names.
 
     Raises:
-        EnvironmentFailure: there is no such device here.
+        EnvironmentFailure: there is no such device here, or it cannot be used.
         UsageError: there is no such kind of device.
     """
     available = torch.cuda.is_available()
@@ -30,9 +31,32 @@ def choose_device(name: str) -> torch.device:
     if name.startswith("cuda") and not available:
         raise EnvironmentFailure("--device=cuda, but torch finds no CUDA device; use --device=cpu")
     try:
-        return torch.device(name)
+        device = torch.device(name)
     except RuntimeError as error:
         raise UsageError(f"unknown --device {name!r}; expected cpu, cuda or auto") from error
+    try:
+        torch.ones(1, device=device).item()
+    except (AssertionError, ImportError, RuntimeError) as error:  # torch lacks its backend, or else
+        raise EnvironmentFailure(
+            f"--device={name} cannot be used ({_reason(error)}); use --device=cpu"
+        ) from error
+    return device
+
+
+@contextmanager
+def reporting_full_memory() -> Iterator[None]:
+    """Raise `EnvironmentFailure` if the memory of the device does not suffice for the block."""
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise EnvironmentFailure(
+            f"the memory of the device does not suffice ({_reason(error)}); lower --batch_size, or "
+            "end other programs that use the device"
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
 
 
 def choose_bf16(name: str, device: torch.device) -> bool:

@@ -6,12 +6,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
+import draccus
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
+
+if TYPE_CHECKING:
+    from egovcp_train.config import TrainConfig
 
 RUN_ID: Final = "wandb/run_id.txt"
 
@@ -141,3 +145,15 @@ class WandbLogger(_RunLogger):
             artifact = self._package.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
             artifact.add_dir(str(folder))
             self._run.log_artifact(artifact)
+
+
+def make_loggers(config: TrainConfig, output: Path) -> list[Logger]:
+    """The loggers that the options of a run select."""
+    found: list[Logger] = []
+    if config.tensorboard:
+        found.append(TensorBoardLogger(output))
+    if config.wandb.enable:
+        found.append(WandbLogger(output, config.wandb, draccus.encode(config)))
+    if config.trackio:
+        found.append(TrackioLogger(output, config.trackio, draccus.encode(config)))
+    return found

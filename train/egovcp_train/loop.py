@@ -25,8 +25,8 @@ from egovcp_train.privileged_value import Critic
 _MAX_GRAPHS: Final = 64
 """Most captured graphs: one per combination of the integers in `StepNoise`, 8 by default."""
 _CRITIC_START: Final = 0.1
-"""Part of the run before the critic is updated: until then Q, which chooses the critic's next
-action, cannot rank actions."""
+"""Part of the steps, or of the time for them, before the critic is updated: until then Q, which
+chooses the critic's next action, cannot rank actions."""
 _MAX_SKIPPED: Final = 3  # consecutive steps whose loss or gradient is not finite
 
 type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...], Carry]
@@ -84,7 +84,7 @@ class Learner:
         return self._gradients.error if isinstance(self._gradients, GraphedFunction) else ""
 
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
-        """One gradient step at ``progress`` in [0, 1] of the run; returns scalar metrics."""
+        """One gradient step at ``progress`` in [0, 1]; returns scalar metrics."""
         self.model.train()
         lr = self.learning_rate(progress)
         for group in self.optimizer.param_groups:
@@ -204,14 +204,17 @@ class Budget:
         max_minutes: float,
         clock: Callable[[], float] = time.monotonic,
         spent: float = 0.0,
+        fit_seconds: float = 0.0,
     ) -> None:
         """
         Args:
             max_minutes: time limit; 0: none.
-            spent: seconds that the run took before it was resumed.
+            spent: seconds that the run took before it was resumed, or before its first step.
+            fit_seconds: seconds before the first step, part of the limit but not of the progress.
         """
         self.steps, self.seconds, self._clock = steps, 60 * max_minutes, clock
         self._start = clock() - spent
+        self.fit_seconds = fit_seconds
 
     @property
     def spent(self) -> float:
@@ -219,8 +222,12 @@ class Budget:
         return self._clock() - self._start
 
     def progress(self, step: int) -> float:
-        """Fraction of the run that is done, in [0, 1]."""
+        """Fraction of the steps, or of the time for them, that is done, in [0, 1]."""
         by_steps = step / self.steps
         if not self.seconds:
             return min(1.0, by_steps)
-        return min(1.0, max(by_steps, self.spent / self.seconds))
+        spent = self.spent
+        if spent >= self.seconds:
+            return 1.0
+        by_time = (spent - self.fit_seconds) / (self.seconds - self.fit_seconds)
+        return min(1.0, max(by_steps, by_time))

@@ -17,6 +17,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import compress
 from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
@@ -74,16 +75,16 @@ class Inputs(NamedTuple):
 class Transitions:
     """Inputs and rewards of the N rows of episodes, and which rows have a successor.
 
-    The mirrored inputs of a robot that is not symmetric are its inputs.
+    The mirrored inputs are the inputs if the robot is not symmetric, or without ``mirror``.
     """
 
-    def __init__(self, model: WorldModel, store: EpisodeStore) -> None:
+    def __init__(self, model: WorldModel, store: EpisodeStore, mirror: bool = True) -> None:
         """Those of ``store``, on the device of ``model``, whose normalisation is used."""
         self.model = model
         device = model.state_mean.device
         robot = store.robot
         self.inputs = self.mirrored = Inputs.of(model, store.state, store.privileged, store.action)
-        if robot.mirror is not None:
+        if mirror and robot.mirror is not None:
             self.mirrored = Inputs.of(
                 model,
                 robot.mirrored_state(store.state),
@@ -136,10 +137,11 @@ def correlation(model: WorldModel, store: EpisodeStore, value: PrivilegedValue) 
 
 
 def has_objects(store: EpisodeStore) -> bool:
-    """Whether every dataset of a store records the positions of objects."""
+    """Whether some episode of each task in each dataset records positions of its object."""
     seen = store.privileged[:, spec.OBJECT_KNOWN] > 0
-    known = np.add.reduceat(seen, store.start, dtype=np.int64)
-    return all(known[store.dataset == number].any() for number in np.unique(store.dataset))
+    known = np.logical_or.reduceat(seen, store.start)
+    groups = list(zip(store.dataset.tolist(), store.tasks, strict=True))
+    return set(groups) == set(compress(groups, known))
 
 
 class Critic:
@@ -220,7 +222,9 @@ class Critic:
             actions = _candidates(batch.prev_action, batch.action[:, :, None], sampled)
             with precision(actions.device, bf16):
                 returns = model.value(states.map(lambda x: x[:, :, None]), actions)
-            best = self._best(returns.flatten(0, 1), actions.flatten(0, 1), batch.prev_action)
+            best = self._best(
+                returns.flatten(0, 1), actions.flatten(0, 1), batch.prev_action, model.discount
+            )
             action = actions.flatten(0, 1)[torch.arange(len(best), device=best.device), best]
             later = self._target(state, features, action.view_as(batch.action))
             later = later * model.return_std + model.return_mean
@@ -245,17 +249,18 @@ class Critic:
             with precision(actions.device, bf16):
                 later = self._target(then.state[:, None], then.features[:, None], actions)
             later = later * model.return_std + model.return_mean
-            best = self._best(later, actions, now.action)
+            best = self._best(later, actions, now.action, model.discount)
             later = later.gather(1, best[:, None])[:, 0].masked_fill(failed, 0.0)
             expected = (reward + model.discount * later - model.return_mean) / model.return_std
         self._backward((self.value(*now) - expected).square().mean())
         self.step()
 
-    def _best(self, returns: Tensor, actions: Tensor, previous: Tensor) -> Tensor:
+    def _best(self, returns: Tensor, actions: Tensor, previous: Tensor, discount: Tensor) -> Tensor:
         """Indices (n,) of the best of actions (n, M, 7) by the planner's J, from the returns
-        (n, M) and the previous actions (..., 7)."""
+        (n, M), the previous actions (..., 7) and the discount per step."""
         start = previous.reshape(len(actions), 1, -1)
-        return (returns - action_costs(start, actions[:, :, None], self._one_step)).argmax(1)
+        costs = action_costs(start, actions[:, :, None], self._one_step, discount)
+        return (returns - costs).argmax(1)
 
     def _backward(self, loss: Tensor) -> Tensor:
         gradients = torch.autograd.grad(loss, self.parameters)
@@ -287,6 +292,7 @@ def fit(
     seed: int,
     progress: Callable[[int], float],
     bf16: bool = False,
+    mirror: bool = True,
 ) -> Critic:
     """Fit a value to the episodes of ``store``; shows its progress.
 
@@ -298,8 +304,9 @@ def fit(
         seed: seed of weights and draws.
         progress: part of the fit, in [0, 1], that is done after so many updates.
         bf16: compute the values of the next rows with matrix products in bfloat16.
+        mirror: mirror half of the rows left to right.
     """
-    rows = Transitions(model, store)
+    rows = Transitions(model, store, mirror)
     features, device = rows.inputs.features, rows.reward.device
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -310,10 +317,12 @@ def fit(
     seen.copy_((seen.square() + (_OBJECT_ERROR * model.object_std).square()).sqrt())
     critic = Critic(value, planner, config.lr)
     generator = torch.Generator(device=device).manual_seed(seed)
+    updates = 0  # a disabled bar does not count
     with tqdm(total=config.updates, desc="privileged value", mininterval=1.0) as bar:
-        while (done := progress(bar.n)) < 1:
+        while (done := progress(updates)) < 1:
             critic.set_learning_rate(config.lr * 0.5 * (1 + math.cos(math.pi * done)))
             critic.fit_step(model, rows, config.rows, generator, bf16)
+            updates += 1
             bar.update()
     return critic
 
@@ -327,22 +336,25 @@ def prepare(
     """`fit` the critic of a run, and say how well it agrees with returns.
 
     Returns:
-        None unless q_target=privileged and every dataset records object positions.
+        None unless q_target=privileged, and the training episodes of each task in each dataset
+        record object positions.
     """
     config = data.config
     if config.policy.loss.q_target != "privileged":
         return None
-    if not has_objects(data.heldout):
-        echo("not every dataset has positions of objects: Q is fitted to returns")
+    store = data.training_episodes()
+    if not has_objects(store):
+        echo("not every task of each dataset has positions of objects: Q is fitted to returns")
         return None
     critic = fit(
         model,
-        data.training_episodes(),
+        store,
         config.optimizer.privileged_value,
         config.planner,
         config.seed,
         progress,
         bf16,
+        config.sampling.mirror,
     )
     found = correlation(model, data.heldout, critic.value)
     echo(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +21,6 @@ from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
-from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
@@ -36,6 +36,7 @@ from egovcp_train.checkpoint import (
     new_checkpoint,
     prepare_output,
     pretrained_weights,
+    require_same_returns,
     restoring,
     resumed_options,
 )
@@ -43,20 +44,25 @@ from egovcp_train.closed_loop import ClosedLoop
 from egovcp_train.config import PRESETS, TrainConfig
 from egovcp_train.datasets import (
     EVALUATION_EPISODES,
-    FRAME_BYTES,
     TrainingData,
     check_options,
     convert_if_needed,
     open_readers,
     prepare,
+    require_batch_memory,
     require_datasets,
     require_same_content,
     to_tensors,
 )
-from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
+from egovcp_train.device import (
+    choose_bf16,
+    choose_device,
+    keep_freed_memory,
+    reporting_full_memory,
+)
 from egovcp_train.heldout.pictures import draw, record, table
 from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
-from egovcp_train.loggers import Logger, TensorBoardLogger, TrackioLogger, WandbLogger
+from egovcp_train.loggers import make_loggers
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.publish import publish_trained, reserve_policy, training_versions, write_card
 
@@ -66,7 +72,6 @@ EPILOG = (
     "edit it, and give --config_path."
 )
 _FIT_SHARE: Final = 0.25  # part of --max_minutes that the fit of the critic takes at most
-_BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
     f"{PROG}: steps are correct but many times slower than possible on this GPU, because they "
     "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
@@ -95,22 +100,36 @@ def train(config: TrainConfig) -> None:
     """Run training to its end, or to the first SIGINT or SIGTERM, and write the artifact.
 
     Raises:
-        KeyboardInterrupt: a signal ended it early; the checkpoint is written.
+        KeyboardInterrupt: a signal ended it early; after the first step, the checkpoint is written.
         UsageError: a launcher has started several processes.
+        EnvironmentFailure: the memory of the device does not suffice.
     """
     _require_one_process()
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    _require_batch_memory(config, device)
+    require_batch_memory(config, device)
     output = _prepare_output(config)
     reserve_policy(config.policy)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    is_converted, config = bool(config.features), convert_if_needed(config)
-    with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
-        run = _prepare_run(config, output, device, bf16)
-    run.execute()
+    with reporting_full_memory(), _interrupt_on_sigterm():
+        is_converted, config = bool(config.features), convert_if_needed(config)
+        with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
+            run = _prepare_run(config, output, device, bf16)
+        run.execute()
+
+
+@contextmanager
+def _interrupt_on_sigterm() -> Iterator[None]:
+    """Handle SIGTERM as SIGINT: it raises KeyboardInterrupt, so that folders are removed."""
+    handler = signal.getsignal(signal.SIGINT)
+    handler = handler if callable(handler) else signal.default_int_handler  # SIGINT may be ignored
+    previous = signal.signal(signal.SIGTERM, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
 
 
 def _prepare_run(
@@ -122,19 +141,20 @@ def _prepare_run(
     model = WorldModel(config.policy.world_model(robot), robot)
     initial: dict[str, Tensor] = {}
     if config.policy.pretrained_path and not config.resume:
-        initial = pretrained_weights(model, config.policy.pretrained_path)
+        initial = pretrained_weights(model, config.policy.pretrained_path, config.returns)
     data = prepare(config, readers, model)
     config = data.config
     if initial:
         model.load_state_dict(initial)
     learner = Learner(model.to(device), config.optimizer, config.seed, bf16, config.planner)
     if config.resume:
-        spent = _restore(output, learner, data)
+        spent, fit_seconds = _restore(output, learner, data)
     else:
         updates = config.optimizer.privileged_value.updates
         fitting = Budget(updates, _FIT_SHARE * config.max_minutes)
         learner.critic = privileged_value.prepare(learner.model, data, fitting.progress, bf16)
-        spent = fitting.spent
+        spent = fit_seconds = fitting.spent
+    budget = Budget(config.steps, config.max_minutes, spent=spent, fit_seconds=fit_seconds)
     provenance = _provenance(data)
     simulation = None
     if config.eval_closed_loop:
@@ -143,7 +163,7 @@ def _prepare_run(
         simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    return TrainingRun(config, output, learner, data, device, provenance, simulation, spent)
+    return TrainingRun(config, output, learner, data, device, provenance, budget, simulation)
 
 
 def _require_one_process() -> None:
@@ -154,14 +174,6 @@ def _require_one_process() -> None:
             f"WORLD_SIZE={count} in the environment: expected one process (1, or unset); start "
             f"{PROG} itself, without torchrun or accelerate launch"
         )
-
-
-def _require_batch_memory(config: TrainConfig, device: torch.device) -> None:
-    """Raise `UsageError` for a batch that is too large for this machine."""
-    size, length = config.batch_size, config.sampling.length
-    option = f"--batch_size={size} with --sampling.length={length}"
-    copies = _BATCH_COPIES if device.type == "cpu" else 1
-    require_memory(option, size * length * copies * FRAME_BYTES)
 
 
 class TrainingRun:
@@ -175,16 +187,16 @@ class TrainingRun:
         data: TrainingData,
         device: torch.device,
         provenance: dict[str, Any],
+        budget: Budget,
         simulation: ClosedLoop | None = None,
-        spent: float = 0.0,
     ) -> None:
         self.config, self.output, self.learner, self.data = config, output, learner, data
         self.device, self.provenance, self.simulation = device, provenance, simulation
-        self.budget = Budget(config.steps, config.max_minutes, spent=spent)
+        self.budget = budget
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
         self.played: dict[str, float] = {}
-        self.loggers = _loggers(config, output)
+        self.loggers = make_loggers(config, output)
 
     def execute(self) -> None:
         """Train until the budget or a signal ends it; the last state is always saved.
@@ -295,6 +307,7 @@ class TrainingRun:
             "stream": self.data.stream.state_dict(),
             "datasets": [reader.content_digest for reader in self.data.readers],
             "seconds": self.budget.spent,
+            "fit_seconds": self.budget.fit_seconds,
         }
         with new_checkpoint(self.output, self.learner.step, state) as folder:
             shipped = self.learner.averaged.without_object_head()
@@ -343,31 +356,24 @@ def _prepare_output(config: TrainConfig) -> Path:
     return output
 
 
-def _loggers(config: TrainConfig, output: Path) -> list[Logger]:
-    found: list[Logger] = []
-    if config.tensorboard:
-        found.append(TensorBoardLogger(output))
-    if config.wandb.enable:
-        found.append(WandbLogger(output, config.wandb, draccus.encode(config)))
-    if config.trackio:
-        found.append(TrackioLogger(output, config.trackio, draccus.encode(config)))
-    return found
-
-
-def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
-    """Restore the last checkpoint; returns the seconds that the run has taken so far.
+def _restore(output: Path, learner: Learner, data: TrainingData) -> tuple[float, float]:
+    """Restore the last checkpoint; returns the seconds that the run has taken so far, and those of
+    them before its first step.
 
     Raises:
         ArtifactError: the networks have changed.
         DataError: the dataset has changed.
-        UsageError: the windows have changed.
+        UsageError: the windows, or discount or scale of the returns, have changed.
     """
     state = load_training_state(output)
     with restoring(output):
         require_same_content(data.readers, state["datasets"])
         learner.load_state_dict(state["learner"])
+        require_same_returns(
+            learner.model.state_dict(), data.config.returns, f"the run in {output}"
+        )
         data.stream.load_state_dict(state["stream"])
-        return float(state["seconds"])
+        return float(state["seconds"]), float(state.get("fit_seconds", 0.0))
 
 
 def _provenance(data: TrainingData) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from egovcp.model import Carry, WorldModel, value
+from egovcp.model.latent_state import Gaussian
 from egovcp.model.networks import SplitMlp
 from egovcp.plan.backends.layers import (
     GruLayer,
@@ -173,9 +174,8 @@ class PlanningNetwork:
         out = self._prior.last(h)
         if noise is None:
             return out
-        mean, raw = out.chunk(2, -1)
-        std = F.softplus(raw + 0.54) + self._model.config.min_std
-        return mean + std * noise
+        prior = Gaussian.from_logits(out, self._model.config.min_std)
+        return prior.mean + prior.std * noise
 
     def _q(self, outputs: Tensor) -> Tensor:
         """Q (...) in units of return, of the value head's outputs (..., width)."""

@@ -27,6 +27,10 @@ WORDS: Final = 32
 """Lanes of float and 16-bit vectors of the widest kernel: outputs are padded to multiples."""
 MAX_WIDE: Final = 1024
 MAX_NARROW: Final = 128
+MAX_ROWS: Final = 16
+"""Candidates of a block of the widest kernel."""
+MAX_STACK_BYTES: Final = 1 << 20
+"""Limit of the actions and values of a block, which are on the stack."""
 LEVELS: Final = 127
 OBJECTIVES: Final = ("value", "reward", "td")
 RULES: Final = ("paper", "shift", "survival")
@@ -108,6 +112,12 @@ class _Packed:
             raise UsageError(
                 f"a latent of {c.latent}: the int8 planner takes up to {MAX_NARROW // 2}; "
                 f"{library.FLOAT32_HINT}"
+            )
+        numbers = config.actions * (model.robot.action_dim + 2)  # of a candidate
+        if 4 * MAX_ROWS * numbers > MAX_STACK_BYTES:
+            raise UsageError(
+                f"a plan of {config.actions} steps of {model.robot.action_dim} actions is too long "
+                f"for the int8 planner; {library.FLOAT32_HINT}"
             )
         self.network = n = library.CNetwork()
         n.hidden, n.latent, n.actions = c.hidden, c.latent, model.robot.action_dim

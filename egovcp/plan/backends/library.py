@@ -25,7 +25,7 @@ SOURCE: Final = Path(__file__).parent / "kernel" / "kernel.c"
 FLAGS: Final = (
     "-O3",
     "-march=native",
-    "-mprefer-vector-width=512",
+    *(("-mprefer-vector-width=512",) if platform.machine() == "x86_64" else ()),  # GCC: x86 only
     "-std=gnu11",
     "-ffp-contract=off",
     "-fno-math-errno",
@@ -154,6 +154,7 @@ class Threads:
             self._kernel.evaluate(self._address)
 
 
+@cache
 def processor_is_fast() -> bool:
     """Whether this processor has AVX-512 VNNI, or AVX2 and FMA, for which the kernel is written."""
     return processor_has("avx512_vnni") or (processor_has("avx2") and processor_has("fma"))

@@ -66,7 +66,7 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     """A task with its scene, sensors and randomisation."""
 
     task: str | None = DEFAULT_TASK
-    """One of `egovcp-task list`, such as ball."""
+    """One of `egovcp-task list` with the G1, such as ball."""
     fps: int = spec.PLANNER_HZ
     """Planner ticks per second; fixed."""
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
@@ -77,7 +77,12 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     """LeRobot's names of the features."""
 
     def __post_init__(self) -> None:
-        find_task(str(self.task), "--env.task")
+        robot = find_task(str(self.task), "--env.task").robot_spec()
+        if not robot.is_g1:
+            raise UsageError(
+                f"--env.task={self.task} is of robot {robot.robot_type}: the features of "
+                "--env.type=egovcp are the G1's; use egovcp-eval"
+            )
         if self.fps != spec.PLANNER_HZ:
             raise UsageError(f"--env.fps={self.fps}; the planner runs at {spec.PLANNER_HZ} Hz")
 

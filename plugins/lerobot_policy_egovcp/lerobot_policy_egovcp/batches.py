@@ -14,7 +14,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid
-from egovcp.data.privileged import mirror_privileged, privileged_features
+from egovcp.data.privileged import DIM, mirror_privileged, privileged_features
 from egovcp.data.source import read_source
 from egovcp.errors import DataError, UsageError
 from egovcp.model import Batch
@@ -34,7 +34,7 @@ _EXPECTED: Final = {
 
 
 def read_observation(
-    batch: Mapping[str, Any],
+    batch: Mapping[str, Any], check_unit: bool = True
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
     """Depth (E, 48, 64) in mm, 0 = invalid, and state (E, 74) of one step of E robots.
 
@@ -42,6 +42,7 @@ def read_observation(
         batch: ``observation.images.ego_depth`` (E, 1, 48, 64) or (E, 48, 64, 1), in millimetres
             of any integer or float type but uint8, and ``observation.state`` (E, 74). Without E
             it is the observation of one robot, as `LeRobotDataset` returns it.
+        check_unit: see `to_millimetres`.
     """
     depth, state = _part(batch, spec.DEPTH_KEY), _part(batch, spec.STATE_KEY)
     if len(depth) != len(state) or len(state) == 0:
@@ -50,16 +51,17 @@ def read_observation(
             "expected one observation of each of at least one robot"
         )
     return (
-        to_millimetres(depth).cpu().numpy().astype(np.uint16),
+        to_millimetres(depth, check_unit).cpu().numpy().astype(np.uint16),
         state.to("cpu", torch.float32).numpy(),
     )
 
 
-def to_millimetres(depth: Tensor) -> Tensor:
+def to_millimetres(depth: Tensor, check_unit: bool = True) -> Tensor:
     """LeRobot's depth (..., 1, 48, 64), millimetres -> (..., 48, 64) whole ones, int32.
 
     Negative and non-finite values become 0, invalid. Raises `DataError` for another type or shape,
-    or another unit.
+    and under ``check_unit`` if nothing is as far as the camera's nearest distance. That shows
+    another unit, or that an object covers the camera: check only the first image of an episode.
     """
     _require_type(spec.DEPTH_KEY, depth)
     if tuple(depth.shape[-3:]) != FEATURE_SHAPES[spec.DEPTH_KEY]:
@@ -67,7 +69,7 @@ def to_millimetres(depth: Tensor) -> Tensor:
     # torch has no arithmetic for uint16
     finite = depth.squeeze(-3).float().nan_to_num(0.0, 0.0, 0.0)
     farthest = float(finite.max()) if finite.numel() else 0.0
-    if 0 < farthest < spec.DEPTH_MIN_M * 1e3:
+    if check_unit and 0 < farthest < spec.DEPTH_MIN_M * 1e3:
         raise DataError(
             f"{spec.DEPTH_KEY} is at most {farthest:g}, less than the camera's nearest "
             f"{spec.DEPTH_MIN_M * 1e3:g} mm: the policy reads millimetres, not metres"
@@ -125,7 +127,11 @@ class RowTargets:
 
     @classmethod
     def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
-        """The targets of a dataset; raises `DataError` if no return is complete."""
+        """The targets of a dataset; raises `DataError` if no return is complete.
+
+        Those of episodes whose file is not there are zeros and not valid: LeRobot downloads only
+        the files of ``--dataset.episodes``.
+        """
         parts = [_episode_targets(reader, i, config) for i in range(len(reader))]
         found = cls(*(torch.from_numpy(np.concatenate(c)) for c in zip(*parts, strict=True)))
         if not found.mc_valid.any():
@@ -152,6 +158,10 @@ class RowTargets:
 
 
 def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) -> tuple[Any, ...]:
+    if not reader.data_path(index).exists():
+        length = int(reader.lengths[index])
+        zeros, never = np.zeros(length, np.float32), np.zeros(length, np.bool_)
+        return zeros, never, never, zeros, np.zeros((length, DIM), np.float32)
     columns = reader.read_episode_columns(index, _COLUMNS)
     reward, terms, done, truncated, position = (columns[name] for name in _COLUMNS)
     if not (np.isfinite(reward).all() and np.isfinite(terms).all()):

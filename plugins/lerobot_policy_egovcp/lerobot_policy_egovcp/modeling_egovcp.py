@@ -66,7 +66,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             open_reader(Path(dataset_meta.root), dataset_meta.repo_id) if dataset_meta else None
         )
         self._targets: RowTargets | None = None
-        self._provenance = _provenance(self._reader)
+        self._provenance = _provenance(self._reader, config)
         self._planner: Policy | None = None
         self.last_predicted_latents: Tensor | None = None
         if self._reader is not None and dataset_stats is not None:
@@ -153,7 +153,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 ``--env.type=egovcp`` write it; the policy must be for that controller.
         """
         self._require_controller(batch.get("info"))
-        depth, state = read_observation(batch)
+        depth, state = read_observation(batch, check_unit=self._planner is None)
         planner = self._planner_for(len(state))
         before = planner.skipped
         step = planner.act(depth, state)
@@ -243,7 +243,7 @@ def _read_config(folder: Path) -> EgovcpConfig:
         raise ArtifactError(f"{folder / CONFIG}: {reason}; the file is damaged") from error
 
 
-def _provenance(reader: DatasetReader | None) -> dict[str, Any]:
+def _provenance(reader: DatasetReader | None, config: EgovcpConfig) -> dict[str, Any]:
     """Provenance for the manifest; empty without a dataset."""
     if reader is None:
         return {}
@@ -251,5 +251,6 @@ def _provenance(reader: DatasetReader | None) -> dict[str, Any]:
     return {
         "controller_id": reader.controller_id,
         "datasets": [{"repo_id": source.repo_id, "revision": source.commit}],
+        "train_config": {"returns": draccus.encode(config.returns)},
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
     }

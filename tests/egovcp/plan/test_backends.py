@@ -28,6 +28,7 @@ from egovcp.plan.backends.integer_network import (
 )
 from egovcp.plan.config import BackendName
 from egovcp.plan.search import random_walk
+from egovcp.robot_spec import G1
 from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 
@@ -257,6 +258,19 @@ def test_unsupported_sizes_are_refused_by_int8_and_planned_in_float32_by_auto() 
     with pytest.raises(UsageError, match=r"20 units.*float32"):
         make_evaluator(model, PlannerConfig(backend="int8"))
     assert isinstance(make_evaluator(model, PlannerConfig(backend="auto")), FloatEvaluator)
+
+
+@needs_compiler
+def test_plans_too_long_for_the_stack_of_the_kernel_are_refused() -> None:
+    names = tuple(f"joint_{i}" for i in range(64))
+    box = spec.ActionBox(*((value,) * 64 for value in (-1.0, 0.0, 1.0)))
+    robot = dataclasses.replace(
+        G1, robot_type="crane", mirror=None, action_names=names, action_box=box
+    )
+    model = toy_model(robot=robot)
+    make_evaluator(model, PlannerConfig(backend="int8", horizon=200))
+    with pytest.raises(UsageError, match=r"300 steps of 64 actions.*float32"):
+        make_evaluator(model, PlannerConfig(backend="int8", horizon=300))
 
 
 @needs_compiler

@@ -105,22 +105,11 @@ def test_run_starts_with_zero_state_and_the_neutral_action() -> None:
     assert policy.carry.h[:, CountingModel.COUNT].tolist() == [1, 1]
 
 
-def test_reset_of_rows_affects_only_these() -> None:
-    policy = Policy(CountingModel(), CONFIG, num_envs=3)
-    _run(policy, 3, robots=3)
-    policy.advance(np.full((3, A), 0.5))
-    policy.reset(np.array([1]))
-    policy.act(*_see(3, 3))
-    assert policy.carry.h[:, CountingModel.COUNT].tolist() == [4, 1, 4]
-    np.testing.assert_allclose(_led(policy.carry)[[0, 2]].numpy(), 0.5)
-    assert not _led(policy.carry)[1].any()
-
-
 class _PlanCall(NamedTuple):
     """Arguments and result of a plan."""
 
-    executed: Tensor
     warm: Tensor
+    discount: Tensor
     plan: Plan
 
 
@@ -138,9 +127,12 @@ def plan_calls(monkeypatch: pytest.MonkeyPatch) -> list[_PlanCall]:
         generator: torch.Generator,
         warm: Tensor,
         remaining: Callable[[], float] | None,
+        discount: Tensor,
     ) -> Plan:
-        plan = make_plan(evaluator, optimiser, carry, executed, config, generator, warm, remaining)
-        calls.append(_PlanCall(executed.clone(), warm.clone(), plan))
+        plan = make_plan(
+            evaluator, optimiser, carry, executed, config, generator, warm, remaining, discount
+        )
+        calls.append(_PlanCall(warm.clone(), discount, plan))
         return plan
 
     monkeypatch.setattr("egovcp.plan.policy.make_plan", record)
@@ -155,34 +147,11 @@ def test_each_plan_starts_at_the_shifted_one_before(plan_calls: list[_PlanCall])
         assert before.plan.deltas.any()
 
 
-def test_a_row_after_its_reset_plans_from_the_neutral_action_at_rest(
-    plan_calls: list[_PlanCall],
-) -> None:
-    policy = Policy(CountingModel(drift=0.3), CONFIG, num_envs=2)
-    _run(policy, 3)
-    policy.advance(np.full((2, A), 0.9))
-    policy.reset(np.array([1]))
-    step = policy.act(*_see(2, 3))
-    assert plan_calls[-1].warm[0].any()
-    assert not plan_calls[-1].warm[1].any()
-    np.testing.assert_allclose(plan_calls[-1].executed.numpy(), [[0.9] * A, [0.0] * A], atol=1e-6)
-    assert np.abs(step.action[1]).max() <= spec.ACTION_ETA + 1e-6
-
-
-def test_a_row_after_its_reset_filters_as_a_new_robot_does() -> None:
-    model = toy_model()
-    policy, new = Policy(model, CONFIG, num_envs=2), Policy(model, CONFIG, num_envs=1)
-    _run(policy, 3)
-    policy.reset(np.array([1]))
-    for tick in (3, 4):
-        sight = _see(2, tick)
-        policy.act(*sight)
-        new.act(*_rows(sight, [1]))
-        for mine, other in zip(policy.carry, new.carry, strict=True):
-            torch.testing.assert_close(mine[1:], other, rtol=1e-4, atol=1e-5)
-        sent = np.full((2, A), 0.1)
-        policy.advance(sent)
-        new.advance(sent[1:])
+def test_costs_of_actions_have_the_discount_of_the_model(plan_calls: list[_PlanCall]) -> None:
+    model = CountingModel()
+    model.discount.fill_(0.9)
+    _run(Policy(model, CONFIG, num_envs=2), 1)
+    assert float(plan_calls[0].discount) == pytest.approx(0.9)
 
 
 def test_a_seed_repeats_a_run_and_a_full_reset_starts_it_again() -> None:
@@ -385,6 +354,14 @@ def test_impossible_finite_values_do_not_enter_the_carry(damage: Damage) -> None
         for tick in (BAD_STEP, 19)
     )
     assert late < 0.5 * early
+
+
+def test_states_of_other_robots_are_bounded_by_float32_alone() -> None:
+    robot = dataclasses.replace(G1, robot_type="crane", mirror=None)
+    policy = Policy(toy_model(robot=robot), FAST_CONFIG, ROBOTS)
+    depth, state = _observation(0)
+    state[0, 0], state[1, 0], state[2, 0] = 5e3, np.inf, np.nan
+    assert policy.act(depth, state).skipped.tolist() == [False, True, True]
 
 
 def test_depth_that_is_not_finite_is_invalid_depth() -> None:

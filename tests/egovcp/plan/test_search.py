@@ -15,7 +15,7 @@ from egovcp.plan import Plan, PlannerConfig, Policy, ReferenceEvaluator, make_pl
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import BackendName, Objective, OptimiserName
 from egovcp.plan.objective import PlanValue
-from egovcp.plan.search import random_walk, reflect_once, target_deltas
+from egovcp.plan.search import action_costs, random_walk, reflect_once, target_deltas
 from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 from tests.support.worlds import Point, PointWorld, plain_planner
@@ -132,6 +132,13 @@ def test_value_of_a_plan_is_the_objective_less_the_discounted_action_costs(
     torch.testing.assert_close(
         plan.candidate_values, values - torch.tensor(costs), rtol=0, atol=1e-4
     )
+
+
+def test_costs_are_discounted_with_the_given_factor() -> None:
+    config = PlannerConfig(horizon=1, pose_cost=1.0, action_rate_cost=0.0)
+    start, held = torch.ones(1, 1, 7), torch.ones(1, 1, 1, 7)
+    cost = action_costs(start, held, config, torch.tensor(0.5))
+    assert float(cost) == pytest.approx(sum(0.5**k for k in range(spec.RETURN_STEPS)))
 
 
 CONFIG = plain_planner(samples=64, elites=8, iterations=6)

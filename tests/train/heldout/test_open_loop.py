@@ -20,6 +20,7 @@ from egovcp_train.heldout.open_loop import (
     STRIP,
     OpenLoop,
     Strip,
+    _regions,
     most_interesting,
     strips,
 )
@@ -129,6 +130,12 @@ def test_the_error_is_in_millimetres_and_nothing_in_range_is_the_end_of_it() -> 
     assert found["moving"]["4"]["model_mm"] is None
 
 
+def test_nothing_in_range_of_a_short_camera_is_not_near() -> None:
+    near = torch.zeros(1, 2, 48, 64)
+    near[..., 0] = 0.1
+    assert _regions(near, max_m=1.0)["near"].equal(near > 0)
+
+
 def test_a_moving_block_is_moving() -> None:
     """A block 1 m away, before nothing, moves by its own width: what it covers was empty."""
     episodes = _episodes()
@@ -225,6 +232,8 @@ def test_pictures_show_their_content() -> None:
     assert pictures[0].dtype == np.uint8
     assert pictures[0].shape == (*pictures[1].shape[:2], 3)
     assert (pictures[0] != pictures[1]).any(-1).mean() > 0.2
+    slow = strip_picture([plain[0]], planner_hz=10)  # other times below the images
+    assert slow.shape != pictures[0].shape or (slow != pictures[0]).any()
     values = Values(torch.randn(50, 1), torch.randn(50, 1))
     some = calibration_picture(values, {"slope": 1.0, "r2": 0.5, "bias": 0.0})
     flat = calibration_picture(values, {"slope": None, "r2": 0.5, "bias": 0.0})

@@ -130,7 +130,7 @@ def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
     valid = near > 0
     return {
         "valid": valid,
-        "near": near > 1 - NEAR_M / max_m,
+        "near": valid & (near > 1 - NEAR_M / max_m),
         "moving": valid & (moving_pixels(near, _MOVING) > 0),
     }
 

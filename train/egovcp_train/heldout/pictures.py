@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from egovcp.model.depth import to_metres
 from egovcp.packages import is_installed
-from egovcp.spec import PLANNER_DT
+from egovcp.robot_spec import G1
 from egovcp_train.heldout.open_loop import HORIZONS, STRIP, Strip
 from egovcp_train.heldout.report import HeldoutReport, Values
 
@@ -96,21 +96,21 @@ def draw(report: HeldoutReport) -> dict[str, Image]:
     out: dict[str, Image] = {}
     for task, found in report.strips.items():
         if found:
-            out[f"open_loop_{task}"] = strip_picture(found)
+            out[f"open_loop_{task}"] = strip_picture(found, report.planner_hz)
     for task, values in report.values.items():
         if len(values.value):
             out[f"value_{task}"] = calibration_picture(values, report.tasks[task]["value"])
     return out
 
 
-def strip_picture(strips: Sequence[Strip]) -> Image:
+def strip_picture(strips: Sequence[Strip], planner_hz: int = G1.planner_hz) -> Image:
     """Two rows per strip, observed and predicted; one column per horizon; near is bright."""
     lines = [_joined(images) for strip in strips for images in (strip.observed, strip.predicted)]
     sheet = np.concatenate(lines)
     height, width = sheet.shape[0] / len(lines), sheet.shape[1] / len(STRIP)
     figure, axes = _figure(1.2 * len(STRIP), 0.95 * len(lines) + 0.4)
     axes.imshow(sheet, cmap="magma", vmin=0.0, vmax=1.0, interpolation="nearest")
-    ticks = [f"+{k} ({1e3 * k * PLANNER_DT:.0f} ms)" for k in STRIP]
+    ticks = [f"+{k} ({1e3 * k / planner_hz:.0f} ms)" for k in STRIP]
     axes.set_xticks([(i + 0.5) * width for i in range(len(STRIP))], ["filtered", *ticks[1:]])
     names = [f"{kind}\nrow {s.start}" for s in strips for kind in _KINDS]
     axes.set_yticks([(i + 0.5) * height for i in range(len(lines))], names)
@@ -174,7 +174,7 @@ def record(report: HeldoutReport, folder: Path, depth_max_m: float) -> Path | No
     stream.save(path, default_blueprint=_blueprint(report))
     ahead = [
         rr.TimeColumn("ticks_ahead", sequence=STRIP),
-        rr.TimeColumn("time_ahead", duration=[k * PLANNER_DT for k in STRIP]),
+        rr.TimeColumn("time_ahead", duration=[k / report.planner_hz for k in STRIP]),
     ]
     for task, found in report.strips.items():
         for number, strip in enumerate(found):

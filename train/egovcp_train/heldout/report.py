@@ -185,6 +185,8 @@ class HeldoutReport(NamedTuple):
     """Task -> Q and its target, for pictures."""
     strips: dict[str, list[Strip]]
     """Task -> some open-loop predictions, for pictures."""
+    planner_hz: int = G1.planner_hz
+    """Ticks per second."""
 
 
 class TaskMeasurements:
@@ -305,6 +307,7 @@ def measure(
         {task: found.result() for task, found in tasks.items()},
         values,
         {task: found.strips for task, found in tasks.items()},
+        model.robot.planner_hz,
     )
 
 
