@@ -53,7 +53,7 @@ VARIANTS: Final[Mapping[str, Variant]] = {
     "2 ms steps": Variant(options=PhysicsOptions(timestep=0.002)),
     "elliptic cone": Variant(options=PhysicsOptions(cone="elliptic")),
     # Explicit integration of the servos' damping is unstable with 5 ms and gains of +20 %.
-    "Euler, 2 ms": Variant(options=PhysicsOptions(integrator="Euler", timestep=0.002)),
+    "Euler 2 ms": Variant(options=PhysicsOptions(integrator="Euler", timestep=0.002)),
     "payload 3 kg": _with(payload=(3.0, 3.0)),
     "friction 0.4": _with(friction=(0.4, 0.4)),
     "gains -20 %": _with(stiffness_scale=(0.8, 0.8), damping_scale=(0.8, 0.8)),
