@@ -17,13 +17,15 @@ from egovcp_train.train import main as train
 
 
 def run(output: Path, episodes: int, minutes: float, scenarios: int, options: list[str]) -> float:
-    """Return the planner's success rate over new scenarios of the ball task."""
+    """Return the planner's success rate over new scenarios of the ball task; exits with the code of
+    a command that fails."""
     data, policy = output / "dataset", output / "policy"
-    collect(["--task=ball", f"--dataset.root={data}", f"--episodes={episodes}"])
-    train(
-        [f"--dataset.root={data}", f"--output_dir={policy}", f"--max_minutes={minutes}", *options]
-    )
-    evaluate(
+    limit = f"--max_minutes={minutes}"
+    if code := collect(["--task=ball", f"--dataset.root={data}", f"--episodes={episodes}"]):
+        raise SystemExit(code)
+    if code := train([f"--dataset.root={data}", f"--output_dir={policy}", limit, *options]):
+        raise SystemExit(code)
+    if code := evaluate(
         [
             "--task=ball",
             f"--policy.path={policy / 'checkpoints/last/pretrained_model'}",
@@ -31,7 +33,8 @@ def run(output: Path, episodes: int, minutes: float, scenarios: int, options: li
             f"--output_dir={output / 'eval'}",
             "--controllers=planner,hold",
         ]
-    )
+    ):
+        raise SystemExit(code)
     table = json.loads((output / "eval/eval.json").read_text())
     return float(table["ball"]["planner"]["success_rate"])
 

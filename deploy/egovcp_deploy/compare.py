@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -89,8 +90,8 @@ def compare(config: CompareConfig) -> None:
     """Print one line for each task that both runs have played; raises `UsageError` if they cannot
     be compared, `DataError` if an eval_run.json cannot be read."""
     config.check()
-    run = load_evaluation(Path(config.run))
-    other = load_evaluation(Path(config.other or config.run))
+    run = load_evaluation(Path(os.path.expanduser(config.run)))
+    other = load_evaluation(Path(os.path.expanduser(config.other or config.run)))
     seeds = [each.config["seed"] for each in (run, other)]
     if seeds[0] != seeds[1]:
         raise UsageError(

@@ -88,8 +88,7 @@ def grid(task: str) -> list[Action]:
     """Candidates: `BaseTask.constant_actions`, and the neutral pose."""
     kind = find_task(task)
     neutral = (0.0,) * kind.robot_spec().action_dim
-    poses = kind.constant_actions()
-    return [neutral, *[pose for pose in poses if pose != neutral]]
+    return [neutral, *kind.constant_actions()]
 
 
 def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import load_policy
-from egovcp.sim.tasks.registry import find_task
+from egovcp.sim.tasks.registry import DEFAULT_TASK, find_task
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.dry_run import dry_run
 from egovcp_deploy.live.drive import drive
@@ -31,12 +32,18 @@ _EPILOG: Final = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(DeployConfig, deploy, argv, prog=PROG, epilog=_EPILOG)
+    # A task that is not given is not recorded as that of a real robot.
+    unnamed = {"task": ""}
+    return run_command(
+        DeployConfig, deploy, argv, prog=PROG, epilog=_EPILOG, defaults=lambda _: unnamed
+    )
 
 
 def deploy(config: DeployConfig) -> None:
     """Check everything, then drive the robot and record it. Raises `UsageError` (options, folder),
     `ArtifactError`, `EnvironmentFailure` (simulator, robot, camera, disk) or `SafetyStop`."""
+    if config.robot.type == "sim" and not config.task:
+        config = replace(config, task=DEFAULT_TASK)
     check_options(config)
     if config.dry_run:
         dry_run(config)
@@ -71,7 +78,7 @@ def check_options(config: DeployConfig) -> None:
     if robot == "sim":
         require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
         find_task(config.task, "--task")
-    if config.robot.camera.type == "realsense":
+    if robot == "unitree_g1" and config.robot.camera.type == "realsense":
         require_realsense()
     if config.output_dir or not config.dry_run:  # a dry run writes nothing
         check_output_dir(config.output_dir)

@@ -6,6 +6,7 @@ in this file have not been verified on hardware.
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable
@@ -16,9 +17,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import torch
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
+from egovcp.hardware import available_cores
 from egovcp.outputs import nearest_existing, require_writable
 from egovcp.plan import blank_observation, time_left_until
 from egovcp.policy_options import load_policy
@@ -72,12 +75,14 @@ def dry_run(config: DeployConfig) -> None:
     with ThreadPoolExecutor(1) as pool:  # only its thread gets the priority
         granted = pool.submit(raise_priority, CONTROL_PRIORITY).result()
     echo("go     priority: real-time" if granted else f"warn   priority: {NO_PRIORITY}")
-    perform("disk", lambda: check_disk(Path(config.output_dir)))
+    perform("disk", lambda: check_disk(Path(os.path.expanduser(config.output_dir))))
     artifact = perform(
         "policy",
         lambda: load_policy(config.policy, config.planner),
         lambda found: f"{found.path}, for the controller {found.controller_id}",
     )
+    if "OMP_NUM_THREADS" not in os.environ:  # as many threads as in a run, see `drive`
+        torch.set_num_threads(max(1, available_cores() - 1))
     if artifact is not None:
         perform("planner", lambda: check_plan_time(artifact.make_policy(1, config.seed)))
     perform("controller", lambda: check_controller(robot_options.controller, artifact))
@@ -264,14 +269,15 @@ def check_message_rate(stats: ArrivalStats, min_hz: float, max_gap_ms: float) ->
 
 def image_age(ages_ms: list[float], max_ms: float) -> str:
     """Age of the images at their arrival; empty: not reported by the camera. ``max_ms`` is the
-    largest age in the training data."""
+    largest configured age, which should be that of the training data."""
     if not ages_ms:
         return "not measured: the camera does not report when an image was taken"
     median, p99 = np.percentile(ages_ms, [50, 99])
     finding = f"{median:.0f} ms when they arrive, p99 {p99:.0f}; exposure and network not included"
     if median > max_ms:
         raise EnvironmentFailure(
-            f"{finding}; expected at most {max_ms:.0f}, the largest age in the training data: use "
-            "a cable, a smaller camera mode, or a faster machine at the camera"
+            f"{finding}; expected at most {max_ms:.0f}, the largest --env.delay.image_age (set it "
+            "to that of the training data): use a cable, a smaller camera mode, or a faster "
+            "machine at the camera"
         )
     return finding

@@ -15,7 +15,7 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
-from egovcp.log.tick import Fanout, RunInfo, Sink
+from egovcp.log.tick import CameraView, Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
 from egovcp.terminal import echo
 from egovcp_deploy.options import evaluation_versions, video_paths
@@ -57,18 +57,23 @@ def open_viewer(options: LogOptions) -> Iterator[Viewer | None]:
 
 @contextmanager
 def recording(
-    folder: Path, info: RunInfo, options: LogOptions, viewer: Viewer | None, blocking: bool
+    folder: Path,
+    info: RunInfo,
+    options: LogOptions,
+    viewer: Viewer | None,
+    blocking: bool,
+    number: int = 0,
 ) -> Iterator[Sink]:
-    """Sinks of rollout number ``info.episode``. If ``blocking``, the loop may wait for the disk, as
-    in simulated time; else each sink, like any viewer, runs in a separate process."""
-    stem = folder / f"rollout-{info.episode}"
+    """Sinks of rollout ``number``. If ``blocking``, the loop may wait for the disk, as in simulated
+    time; else each sink, like any viewer, runs in a separate process."""
+    stem = folder / f"rollout-{number}"
     mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
     files: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
         from egovcp.log.rerun import RerunSink
 
         files[rrd.name] = RerunSink(rrd)
-    if info.episode < options.videos and is_installed("matplotlib"):
+    if number < options.videos and is_installed("matplotlib"):
         from egovcp.log.picture import PictureSink
 
         files[f"{stem.name}.gif"] = PictureSink(stem.with_suffix(".png"), *video_paths(stem))
@@ -102,11 +107,19 @@ def missing_ticks(sink: Sink) -> dict[str, int]:
 def run_info(
     config: DeployConfig, controller_id: str, artifact: Artifact | None, backend: str
 ) -> RunInfo:
-    """The first record of the log of a G1's rollout 0; ``backend`` see `backend_of`."""
+    """The first record of the log of a G1's rollout 0; ``backend`` see `backend_of`.
+
+    Its camera is the configured one of a real robot, in the middle of the range of pitches.
+    """
     files = artifact.manifest["files"] if artifact else {}
+    mount, options = config.env.camera, config.robot.camera
+    fov = (options.realsense if options.type == "realsense" else options.server).vertical_fov
     return RunInfo(
         task=config.task,
         seed=config.seed,
+        camera=CameraView(
+            position=mount.position, pitch=sum(mount.pitch_range) / 2, vertical_fov=fov
+        ),
         config=config.encoded(),
         hashes={_CONTROLLER: controller_id, **files},
         versions=evaluation_versions(),

@@ -7,6 +7,7 @@ With o_{t+1} the planner receives the action that was sent, and advances its rec
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,8 @@ from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.files import write_json
-from egovcp.log.tick import Sink, Tick
+from egovcp.log.mcap_reader import RecordingReader
+from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
@@ -161,7 +163,7 @@ def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
 def replay(config: DeployConfig, artifact: Artifact) -> Path:
     """Plan again on recorded observations, of at most ``episodes`` recordings. Returns the output
     folder. Raises as `deploy`, and `DataError` for a damaged recording or another controller."""
-    robot = open_recordings(Path(config.robot.recordings))
+    robot = open_recordings(Path(os.path.expanduser(config.robot.recordings)))
     artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, len(robot.files)))
     return _play(config, artifact, robot, artifact.make_policy(1, config.seed))
@@ -180,21 +182,29 @@ def _play(
     folder = make_output_dir(config.output_dir)
     backend = backend_of(policy)
     summaries: list[RolloutSummary] = []
+    infos: list[RunInfo] = []
     try:
         with (
             open_viewer(config.log) as viewer,
-            tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar,
+            tqdm(total=config.episodes, unit="rollout", desc=config.task or "replay") as bar,
         ):
             for episode in range(config.episodes):
                 robot.start(episode)
+                task, seed, number = config.task, config.seed, episode
+                if isinstance(robot, ReplayRobot):
+                    recorded = RecordingReader(robot.files[episode]).info
+                    task, seed, number = recorded.task, recorded.seed, recorded.episode
                 info = replace(
                     run_info(config, robot.controller_id, artifact, backend),
-                    episode=episode,
+                    task=task,
+                    seed=seed,
+                    episode=number,
                     camera=robot.camera,
                     robot=robot.spec,
                     fps=robot.spec.planner_hz,
                 )
-                with recording(folder, info, config.log, viewer, blocking=True) as sink:
+                infos.append(info)
+                with recording(folder, info, config.log, viewer, True, episode) as sink:
                     summaries.append(
                         run_rollout(planner, robot, sink, config.robot.limits, partial(_show, bar))
                     )
@@ -202,10 +212,12 @@ def _play(
     finally:
         if summaries:
             report = {
-                "task": config.task,
-                "seed": config.seed,
+                "task": infos[0].task,
+                "seed": infos[0].seed,
                 "success_rate": float(np.mean([summary.success for summary in summaries])),
-                "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
+                "rollouts": [
+                    _row(i, *each) for i, each in enumerate(zip(infos, summaries, strict=False))
+                ],
                 **provenance(info),
             }
             write_json(folder / "deploy.json", report)
@@ -230,9 +242,11 @@ def _show(bar: Any, tick: Tick) -> None:
     bar.update(0)
 
 
-def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
+def _row(rollout: int, info: RunInfo, summary: RolloutSummary) -> dict[str, Any]:
     return {
-        "episode": episode,
+        "task": info.task,
+        "seed": info.seed,
+        "episode": info.episode,
         "steps": summary.steps,
         "reward_mean": summary.reward / summary.steps,
         "success": summary.success,
@@ -243,6 +257,6 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "held_ticks": summary.held,
         "damped": summary.damped,
         **percentiles("plan_ms", summary.plan_ms),
-        "mcap": f"rollout-{episode}.mcap",
-        "rrd": f"rollout-{episode}.rrd",
+        "mcap": f"rollout-{rollout}.mcap",
+        "rrd": f"rollout-{rollout}.rrd",
     }

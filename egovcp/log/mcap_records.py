@@ -28,7 +28,8 @@ _FOOTER_START: Final = struct.pack("<BQ", Opcode.FOOTER, 20)
 _BLOCK_BYTES: Final = 1 << 20
 #: Longer records and chunks count as damaged, so that a damaged length allocates no more.
 _MAX_BYTES: Final = 256 << 20
-_ERRORS: Final = (
+#: Raised when damaged records are read.
+MCAP_ERRORS: Final = (
     McapError,
     struct.error,
     ValueError,
@@ -76,7 +77,7 @@ class RecordFile:
                             break
                         if isinstance(record, Metadata):
                             yield record
-                except _ERRORS:
+                except MCAP_ERRORS:
                     continue
 
     def _indexed(self, file: IO[bytes]) -> Iterator[Chunk | None]:
@@ -86,7 +87,7 @@ class RecordFile:
             content = file.read(min(entry.chunk_length, _MAX_BYTES))
             try:
                 record = next(_records(BytesIO(content), 0))
-            except _ERRORS:
+            except MCAP_ERRORS:
                 record = None
             yield record if isinstance(record, Chunk) else None
 
@@ -97,7 +98,7 @@ class RecordFile:
                     yield record
                 elif isinstance(record, DataEnd):
                     return
-        except _ERRORS:
+        except MCAP_ERRORS:
             self.torn = True
 
     def _read_summary(self, file: IO[bytes]) -> Summary | None:
@@ -118,7 +119,7 @@ class RecordFile:
         file.seek(0)
         try:
             return make_reader(file).get_summary()
-        except _ERRORS:
+        except MCAP_ERRORS:
             return None
 
     def _checksums_match(self, file: IO[bytes]) -> bool:
@@ -147,5 +148,5 @@ def _unpack(chunk: Chunk) -> list[McapRecord] | None:
         if chunk.compression == "zstd":
             size = max(size, zstandard.frame_content_size(chunk.data))
         return None if size > _MAX_BYTES else breakup_chunk(chunk, validate_crc=True)
-    except _ERRORS:
+    except MCAP_ERRORS:
         return None

@@ -56,6 +56,7 @@ def one_robot(tasks: Iterable[str]) -> RobotSpec:
     first, *others = dict.fromkeys(tasks)
     robot = find_task(first).robot_spec()
     require_robot(robot, others)
+    require_class(getattr(find_task(first), "robot_class", None), others)
     return robot
 
 
@@ -67,6 +68,18 @@ def require_robot(robot: RobotSpec, tasks: Iterable[str]) -> None:
             raise UsageError(
                 f"task {task} is of robot {found.robot_type}, expected one of robot "
                 f"{robot.robot_type}: simulate, train and evaluate each robot by itself"
+            )
+
+
+def require_class(robot_class: type | None, tasks: Iterable[str]) -> None:
+    """Raise `UsageError` unless all ``tasks`` have this `RobotTask.robot_class`; None: the G1."""
+    for task in tasks:
+        found = getattr(find_task(task), "robot_class", None)
+        if found is not robot_class:
+            names = [getattr(kind, "__qualname__", "the G1") for kind in (found, robot_class)]
+            raise UsageError(
+                f"the robot_class of task {task} is {names[0]}, expected {names[1]}: simulate, "
+                "train and evaluate each robot by itself"
             )
 
 
@@ -164,14 +177,14 @@ class BaseVectorEnv(ABC):
 
     @abstractmethod
     def _in_range(self, position: Array) -> bool:
-        """Whether ``position`` (3,), m, base frame, is in front of the robot and within the range
-        of the depth camera; its field of view is ignored."""
+        """Whether ``position`` (3,), m, base frame, is within the range of the depth camera, and of
+        the G1 also in front of the pelvis; the field of view is ignored."""
 
     def known_objects(self) -> NDArray[np.float32]:
         """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
 
-        An object is known while it is in front of the robot, within the depth range, and still
-        matters to the task.
+        An object is known while it is within the depth range, of the G1 also in front of it, and
+        still matters to the task.
         """
         found = np.zeros((self.num_envs, OBJECT_DIM), np.float32)
         for row, task in enumerate(instance.task for instance in self.instances):

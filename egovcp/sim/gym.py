@@ -82,7 +82,8 @@ def _first_row(observation: Observation) -> GymObservation:
 
 
 def register() -> None:
-    """Register ``egovcp/<task>-v0`` for every installed task; safe to call twice."""
+    """Register ``egovcp/<task>-v0`` for every installed task of which datasets can be collected, so
+    not for ``sequence``; safe to call twice."""
     for task in task_names(training=True):
         name = f"egovcp/{task}-v0"
         if name not in gymnasium.registry:

@@ -63,9 +63,10 @@ class SimulatedRobot:
         model.geom_rbound[geom] = size[0] if len(size) == 1 else np.linalg.norm(extent)
         first = model.body_bvhadr[body]
         nodes = model.bvh_aabb[first : first + model.body_bvhnum[body]]
-        reach = np.abs(centre) + extent
+        # boxes around the body's centre of mass, in the axes of its inertia
+        reach = np.linalg.norm(centre - model.body_ipos[body]) + np.linalg.norm(extent)
+        nodes[:, 3:] = np.maximum(np.abs(nodes[:, :3]) + nodes[:, 3:], reach)
         nodes[:, :3] = 0.0
-        nodes[:, 3:] = np.maximum(nodes[:, 3:], reach)
 
     def reset(self, pose: StandingPose) -> None:
         """Place the robot at rest in ``pose``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from egovcp.errors import SimulationDiverged
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.base_env import BaseInstance, BaseVectorEnv, Observation, StepResult, one_robot
+from egovcp.sim.base_env import (
+    BaseInstance,
+    BaseVectorEnv,
+    Observation,
+    StepResult,
+    one_robot,
+    require_class,
+)
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.mujoco_robot import Array, MujocoRobot
 from egovcp.sim.scenario import Scenario
@@ -113,6 +120,10 @@ class RobotEnv(BaseVectorEnv):
     def controller_id(self) -> str:
         """`MujocoRobot.control_id`."""
         return self._class.control_id
+
+    def _check(self, scenarios: Sequence[Scenario]) -> None:
+        super()._check(scenarios)
+        require_class(self._class, [scenario.task for scenario in scenarios])
 
     def _instance(self, scenario: Scenario) -> RobotInstance:
         return RobotInstance(self.config, scenario)

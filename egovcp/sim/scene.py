@@ -134,11 +134,13 @@ def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex
     names = [model.geom(i).name for i in range(model.ngeom)]
     owner = {model.body(body).id: task for task, own in objects.items() for body in own}
     object_bodies = list(owner)
+    is_object = np.isin(model.geom_bodyid, object_bodies)
+    robot_names = ["" if own else name for name, own in zip(names, is_object, strict=True)]
     first = model.joint(JOINT_NAMES[0])
     qpos, qvel = int(first.qposadr[0]), int(first.dofadr[0])
     return SceneIndex(
-        part=np.array([_part(name) for name in names], dtype=np.int8),
-        is_object=np.isin(model.geom_bodyid, object_bodies),
+        part=np.array([_part(name) for name in robot_names], dtype=np.int8),
+        is_object=is_object,
         objects={
             task: tuple(
                 geom for geom, body in enumerate(model.geom_bodyid) if owner.get(body) == task
@@ -146,7 +148,7 @@ def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex
             for task in objects
         },
         floor=model.geom(FLOOR).id,
-        foot_geoms=np.array([i for i, name in enumerate(names) if "_foot" in name]),
+        foot_geoms=np.array([i for i, name in enumerate(robot_names) if "_foot" in name]),
         robot_bodies=np.setdiff1d(np.arange(1, model.nbody), object_bodies),
         torso_body=model.body("torso_link").id,
         palm_sites=np.array([model.site(f"{side}_palm").id for side in ("left", "right")]),
@@ -156,7 +158,7 @@ def _index(model: mujoco.MjModel, objects: Mapping[str, set[str]]) -> SceneIndex
 
 
 def _part(geom: str) -> int:
-    """Index into ``PARTS`` of a geom name, -1 for floor and objects."""
+    """Index into ``PARTS`` of a geom name, -1 for the floor and no name."""
     if not geom.endswith("_collision"):
         return -1
     part = _PART_OF.get(geom.removesuffix("_collision"), "leg")

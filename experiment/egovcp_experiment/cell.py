@@ -197,7 +197,7 @@ COLLECT: Final = CellCommand(
     output="dataset.root",
     figures=_collect_figures,
     digest=lambda folder: sha256(folder / HASHES_PATH),
-    resume_flags=lambda folder: {"resume": True} if folder.exists() else None,
+    resume_flags=lambda folder: {"resume": True},  # staged episodes are beside the folder
 )
 TRAIN: Final = CellCommand(
     module="egovcp_train.train",

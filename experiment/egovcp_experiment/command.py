@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -55,7 +56,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
     prog, name = argv[:2]
     experiment = EXPERIMENTS[name]
     cells = experiment.cells(config)
-    store = CellStore(Path(config.output_dir))
+    store = CellStore(Path(os.path.expanduser(config.output_dir)))
     with store.locked():
         scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records

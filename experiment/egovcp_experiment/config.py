@@ -11,6 +11,7 @@ from egovcp.errors import UsageError, suggest
 
 #: The paper's tasks.
 TASKS: Final = ("ball", "wall", "arch")
+_PLAY_SEED: Final = 2  # options were tuned on the scenarios of seeds 0, 1 and 3
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ class ExperimentConfig:
     tasks: tuple[str, ...] = TASKS
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
-    """Names of the variants to run; empty: all."""
+    """Names of the variants to run, if the experiment has variants; empty: all."""
     most: int = bounded(0, least=0)
     """Run only the first variants, at most this many; 0: all."""
     scenes: tuple[str, ...] = ()
@@ -251,9 +252,8 @@ def small() -> ExperimentConfig:
             compared_steps=1000,
             flags=("--eval_freq=0", "--tensorboard=false"),
         ),
-        # Options were tuned on the scenarios of seeds 0, 1 and 3. 12 ms are 64 candidates on one
-        # core without AVX-512.
-        play=PlayConfig(seed=2, branches=6, budget_ms=12.0),
+        # 12 ms are 64 candidates on one core without AVX-512.
+        play=PlayConfig(seed=_PLAY_SEED, branches=6, budget_ms=12.0),
     )
 
 
@@ -268,7 +268,7 @@ def paper() -> ExperimentConfig:
             steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
         ),
         ppo=PpoBaselineConfig(steps=5_000_000, policies=10),
-        play=PlayConfig(episodes=300),
+        play=PlayConfig(episodes=300, seed=_PLAY_SEED),
     )
 
 

@@ -9,11 +9,14 @@ references-TASK            the same with constant, which needs an expensive sear
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artifact import policy_folder, shipped_policies
+from egovcp.data.schema import INFO_PATH
 from egovcp_experiment.cell import (
     ARTIFACT,
     COLLECT,
@@ -23,6 +26,7 @@ from egovcp_experiment.cell import (
     CellOutput,
     ExternalPath,
     Flags,
+    read_json,
     study,
 )
 from egovcp_experiment.config import ExperimentConfig
@@ -72,9 +76,15 @@ class Grid:
         return cell
 
     def episodes(self, task: str, share: float = 1.0) -> int:
-        """Number of episodes in a share of the configured ones."""
-        whole: int = getattr(self.config.data.episodes, task)
+        """Number of episodes in a share of the given dataset, or of the configured ones."""
+        given = task in self.config.data.roots
+        whole = self.given_size(task)[0] if given else getattr(self.config.data.episodes, task)
         return max(1, round(share * whole))
+
+    def given_size(self, task: str) -> tuple[int, int]:
+        """Episodes and transitions of the dataset in `DataConfig.roots`."""
+        info = read_json(Path(os.path.expanduser(self.config.data.roots[task])) / INFO_PATH)
+        return info["total_episodes"], info["total_frames"]
 
     def data(self, task: str) -> CellOutput | ExternalPath:
         """Random data of a task."""
@@ -177,5 +187,6 @@ class Grid:
 
 
 def parse_flags(flags: Sequence[str]) -> dict[str, str]:
-    """Name -> value of ``--name=value``; the last one counts."""
-    return dict(flag.removeprefix("--").split("=", 1) for flag in flags)
+    """Name -> value of ``--name=value`` or ``--name`` (true); the last one counts."""
+    parts = (flag.removeprefix("--").partition("=") for flag in flags)
+    return {name: value if equals else "true" for name, equals, value in parts}

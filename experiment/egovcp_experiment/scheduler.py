@@ -83,7 +83,8 @@ class CellScheduler:
                 used = {process.slot for process in self._running}
                 slot = next(k for k in range(self._jobs) if k not in used)
                 log = self._store.log(cell)
-                self._running.append(CellProcess(cell, argv, log, slot, self._jobs))
+                jobs = 1 if cell.command.exclusive else self._jobs  # alone: all cores
+                self._running.append(CellProcess(cell, argv, log, slot, jobs))
         return bool(self._ready())
 
     def _has_room(self, cell: Cell) -> bool:

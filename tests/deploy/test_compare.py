@@ -42,11 +42,14 @@ def test_pairing_removes_the_variance_between_scenarios(
     assert (gain, low, high) == ("+0.01000", "+0.01000", "+0.01000")
 
 
-def test_an_interrupted_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_interrupted_run_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
     run, other = (write(tmp_path / name, [0.1, -0.1]) for name in ("run", "other"))
     path = Path(run) / "eval_run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"complete": False}))
-    assert main([f"--run={run}", f"--other={other}"]) == 0
+    assert main(["--run=~/run", "--other=~/other"]) == 0
     printed = capsys.readouterr().out
     assert f"{run} is incomplete: egovcp-eval was interrupted" in printed
     assert f"{other} is incomplete" not in printed

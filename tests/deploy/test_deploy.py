@@ -13,14 +13,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from egovcp import packages
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.viewer import LiveRerun
 from egovcp.sim import robot
-from egovcp.sim.config import EnvConfig
+from egovcp.sim.config import CameraConfig, EnvConfig
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
-from egovcp_deploy import recording
+from egovcp_deploy import deploy, recording
+from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.deploy import main
+from egovcp_deploy.live.hardware import CameraOptions, RobotOptions
 from egovcp_deploy.robots.base import ActionResult
+from egovcp_deploy.robots.realsense_camera import RealSenseConfig
 from egovcp_deploy.robots.sim import SimRobot
 from tests.support.sinks import MemorySink
 
@@ -212,6 +216,59 @@ def test_the_environment_is_recorded(tmp_path: Path, artifact_dir: Path, short: 
     env = report["config"]["env"]
     assert env["wall"]["push_speed_range"] == list(EnvConfig().wall.push_speed_range)
     assert read_recording(out / "rollout-0.mcap").info.config == report["config"]
+
+
+def test_a_replay_has_task_seed_and_episode_of_its_recording(
+    tmp_path: Path, artifact_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = ["--env.controller=stance", "--env.wall_episode.ticks=5"]
+    flags = ["--task=wall", "--controller=hold", "--episodes=2", "--seed=3"]
+    assert run(*flags, *scenes, *UNDRAWN, f"--output_dir={tmp_path / 'played'}") == 0
+    (tmp_path / "played" / "rollout-0.mcap").unlink()
+    monkeypatch.setenv("HOME", str(tmp_path))
+    out = tmp_path / "again"
+    again = ["--robot.type=replay", "--robot.recordings=~/played", f"--policy.path={artifact_dir}"]
+    assert run(*again, *UNDRAWN, f"--output_dir={out}") == 0
+    report = json.loads((out / "deploy.json").read_text())
+    (row,) = report["rollouts"]
+    info = read_recording(out / "rollout-0.mcap").info
+    for found in ((info.task, info.seed, info.episode), (row["task"], row["seed"], row["episode"])):
+        assert found == ("wall", 3, 1)
+    assert (report["task"], report["seed"], row["mcap"]) == ("wall", 3, "rollout-0.mcap")
+
+
+def test_a_simulated_robot_needs_no_camera_driver(
+    tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "pyrealsense2")
+    flags = ["--controller=hold", "--episodes=1", "--robot.camera.type=realsense"]
+    assert run(*flags, *short, *UNDRAWN, f"--output_dir={tmp_path / 'out'}") == 0
+
+
+@pytest.mark.parametrize(("flags", "task"), [([], ""), (["--task=wall"], "wall")])
+def test_the_task_of_a_real_robot_is_recorded_if_it_is_given(
+    flags: list[str],
+    task: str,
+    tmp_path: Path,
+    artifact_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    driven: list[DeployConfig] = []
+    monkeypatch.setattr(deploy, "drive", lambda config, artifact: driven.append(config))
+    given = ["--robot.type=unitree_g1", f"--policy.path={artifact_dir}", *flags]
+    assert run(*given, f"--output_dir={tmp_path / 'out'}") == 0
+    assert recording.run_info(driven[0], "walk", None, "").task == task
+
+
+def test_the_camera_of_a_real_robot_is_the_configured_one() -> None:
+    config = DeployConfig(
+        robot=RobotOptions(
+            camera=CameraOptions(type="realsense", realsense=RealSenseConfig(vertical_fov=0.8))
+        ),
+        env=EnvConfig(camera=CameraConfig(position=(0.1, 0.0, 0.5), pitch_range=(0.1, 0.3))),
+    )
+    camera = recording.run_info(config, "walk", None, "").camera
+    assert (camera.position, camera.pitch, camera.vertical_fov) == ((0.1, 0.0, 0.5), 0.2, 0.8)
 
 
 def test_planner_options_change_the_planner(

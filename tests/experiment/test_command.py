@@ -40,6 +40,8 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
         (["table1", "--output_dir=x", "--train.policies={wal: y}"], "did you mean 'wall'"),
         (["table1", "--output_dir=x", "--train.compared_steps=0"], "expected at least 1"),
         (["ablations", "--output_dir=x", "--train.preset=paper"], "--train.preset=paper"),
+        (["variance", "--output_dir=x", "--only=[horizon_1]"], "--only: this experiment has no"),
+        (["ppo", "--output_dir=x", "--scale=smoke", "--most=1"], "--most: this experiment has no"),
     ],
 )
 def test_misuse_ends_with_2_before_anything_is_written(
@@ -59,10 +61,12 @@ def test_a_missing_package_is_named_before_any_cell_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(packages, "is_installed", lambda name: name != "rsl_rl")
-    assert main(["ppo", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]) == 5
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["ppo", "--output_dir=~/out", "--scale=smoke"]) == 5
     message = capsys.readouterr().err
     assert "egovcp-train-ppo needs rsl-rl-lib, which is not installed" in message
     assert "egovcp-train[lowlevel]" in message
+    assert (tmp_path / "out" / "cells").is_dir()
     assert not (tmp_path / "out" / "logs").exists()
 
 

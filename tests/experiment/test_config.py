@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import UsageError
-from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.config import SCALES, ExperimentConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,3 +27,8 @@ def test_unknown_variants_and_tasks_are_named() -> None:
         replace(ExperimentConfig(), only=("defualt",)).chosen({"default": 1})
     with pytest.raises(UsageError, match="did you mean 'ball'"):
         ExperimentConfig(output_dir="x", tasks=("bal",)).check()
+
+
+@pytest.mark.parametrize("scale", ["small", "paper"])
+def test_results_are_measured_on_scenarios_that_nothing_was_tuned_on(scale: str) -> None:
+    assert SCALES[scale]().play.seed not in (0, 1, 3)

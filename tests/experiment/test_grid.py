@@ -33,7 +33,7 @@ from egovcp_experiment.config import (
     TrainingConfig,
 )
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.grid import ALL, Grid, Model
+from egovcp_experiment.grid import ALL, Grid, Model, parse_flags
 from egovcp_experiment.studies.residuals import ResidualsConfig
 
 CONFIGS = {
@@ -178,3 +178,8 @@ def _config(cell: Cell) -> type[Any]:
 
 def _option_defaults() -> Any:
     return importlib.import_module("egovcp_train.train").option_defaults
+
+
+def test_a_flag_without_a_value_is_true() -> None:
+    found = parse_flags(["--mirror", "--a.b=c=d", "--mirror=", "--resume"])
+    assert found == {"mirror": "", "a.b": "c=d", "resume": "true"}

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp_experiment.cell import Cell, CellFigure, CellOutput, ExternalPath
+from egovcp_experiment.cell import COLLECT, Cell, CellFigure, CellOutput, ExternalPath
+from egovcp_experiment.local_runner import CellProcess
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
 
@@ -107,6 +108,27 @@ def test_exclusive_cells_run_alone_and_last(cell: MakeCell, tmp_path: Path) -> N
     assert sorted(order[2:4]) == ["a done", "b done"]
     assert order[4:8] == ["t begins;", "t done", "u begins;", "u done"]
     assert order[8:] == ["c begins;", "c done"]
+
+
+def test_an_exclusive_cell_has_all_cores(
+    cell: MakeCell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares = {}
+
+    def start(cell: Cell, argv: Sequence[str], log: Path, slot: int, jobs: int) -> CellProcess:
+        shares[cell.name] = jobs
+        return CellProcess(cell, argv, log, slot, jobs)
+
+    monkeypatch.setattr("egovcp_experiment.scheduler.CellProcess", start)
+    shared = cell("a")
+    timing = Cell("t", replace(shared.command, exclusive=True), extra=shared.extra)
+    run([shared, timing], tmp_path / "out", jobs=2)
+    assert shares == {"a": 2, "t": 1}
+
+
+def test_a_collection_without_a_complete_shard_is_resumed(tmp_path: Path) -> None:
+    """Its episodes are staged beside the folder, which does not exist yet."""
+    assert "--resume=true" in CellStore(tmp_path).prepare(Cell("collect", COLLECT))
 
 
 def test_an_interrupted_cell_is_resumed(cell: MakeCell, tmp_path: Path, diary: Path) -> None:

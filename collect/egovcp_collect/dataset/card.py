@@ -13,6 +13,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
+from egovcp.data.provenance import source_provenances
 from egovcp.errors import UsageError
 from egovcp.files import write_text
 from egovcp.help_text import field_docs
@@ -77,9 +78,11 @@ def _render(
     name = repo_id or reader.source.repo_id or f"user/{reader.root.name}"
     tasks = [task.task for task in statistics.tasks]
     provenance = reader.provenance
-    config, versions = provenance.get("config", {}), provenance.get("versions", {})
+    parts = source_provenances(reader.origin)
+    config, versions = common_settings([part.config for part in parts]), reader.origin.versions
     shortest, longest = config.get("step_ticks", (1, 1))
     ranges, constants = settings_tables(config, tasks)
+    numbers = [reader.metadata(index).get("episode") for index in range(len(reader))]
     checks = assess(statistics)
     card = DatasetCard.from_template(
         DatasetCardData(
@@ -99,10 +102,12 @@ def _render(
         fps=reader.fps,
         codebase_version=schema.CODEBASE_VERSION,
         command=str(provenance.get("command") or "not recorded"),
-        seed=str(provenance.get("seed")),
+        seeds=", ".join(dict.fromkeys(str(part.seed) for part in parts if part.seed is not None)),
+        merged=len(parts) > 1,
+        complete=len(parts) == 1 and numbers == [*range(len(reader))],
         versions=", ".join(f"{k} {v}" for k, v in versions.items()) or "not recorded",
         controller_id=reader.controller_id,
-        eta=config.get("eta", spec.ACTION_ETA),
+        eta=config.get("eta"),
         boundary=_BOUNDARY.get(config.get("boundary", ""), "kept inside the box"),
         step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
         ranges=ranges,
@@ -132,6 +137,19 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
     return "\n".join(
         f"| {' | '.join(str(cell).replace('|', r'\|') for cell in line)} |" for line in lines
     )
+
+
+def common_settings(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The nested settings that are equal in all parts."""
+    first, *others = parts
+    common = dict[str, Any]()
+    for name, value in first.items():
+        values = [value, *(other.get(name) for other in others)]
+        if all(isinstance(each, Mapping) for each in values):
+            common[name] = common_settings(values)
+        elif all(each == value for each in values):
+            common[name] = value
+    return common
 
 
 def settings_tables(config: Mapping[str, Any], tasks: Sequence[str]) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -114,7 +115,8 @@ def run_coverage(config: CoverageConfig) -> None:
         echo(f"  {'ok  ' if check.passed else 'warn'}  {check.task}: {check.text}")
     echo(f"  {summary(checks)}")
     if config.output_dir:
-        for path in draw_figures(statistics, config.returns, Path(config.output_dir)):
+        folder = Path(os.path.expanduser(config.output_dir))
+        for path in draw_figures(statistics, config.returns, folder):
             echo(f"wrote {path}")
     assessment = {
         "suitable": all(check.passed for check in checks),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 from collections import Counter
@@ -111,7 +112,7 @@ def as_text(report: dict[str, Any]) -> list[str]:
     run = report["run"]
     lines = [
         f"{report['file']}: {condition}, {report['bytes'] / 1e6:.1f} MB",
-        f"run       {run['task']}, seed {run['seed']}, episode {run['episode']}",
+        f"run       {run['task'] or 'no task'}, seed {run['seed']}, episode {run['episode']}",
         f"ticks     {report['ticks']} in {report['duration_s']:.2f} s, {report['rate_hz']:.2f} Hz",
         f"missing   {report['missing']} ticks in {len(report['gaps'])} gaps",
     ]
@@ -150,7 +151,7 @@ def run(config: RecordingInfoConfig) -> None:
     """Print the summary; then raise `DataError` if the recording is damaged."""
     if not config.file:
         raise UsageError("no recording given; usage: egovcp-mcap info FILE")
-    report, reader = summarise(Path(config.file))
+    report, reader = summarise(Path(os.path.expanduser(config.file)))
     if config.json == STDOUT:
         echo(json.dumps(report, indent=2))
     else:

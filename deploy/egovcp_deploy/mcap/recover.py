@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,8 @@ def run(config: RecoverConfig) -> None:
     recording of ours, `EnvironmentFailure` if the output exists or the disk is full."""
     if not config.file or not config.output:
         raise UsageError("two files are needed; usage: egovcp-mcap recover TRUNCATED OUT")
-    ticks, reader = recover(Path(config.file), Path(config.output))
+    source, output = (Path(os.path.expanduser(file)) for file in (config.file, config.output))
+    ticks, reader = recover(source, output)
     state = "is truncated: its end is missing" if reader.torn else "was already complete"
     if reader.damaged:
         torn = ", and its end is missing" if reader.torn else ""

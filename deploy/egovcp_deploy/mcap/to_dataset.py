@@ -8,10 +8,10 @@ import os
 import shlex
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from egovcp.data import Episode, Provenance
     from egovcp_deploy.mcap.topics import Array, TopicMapping
 
+#: Task of the episode of a recording that names none, as of a real robot.
+UNKNOWN_TASK: Final = "unknown"
 _IMAGE_NAMES = ["height", "width", "channels"]
 _PER_EPISODE = ("pose", "dataset", "index in the dataset", "scenario", "time_limit", "command")
 
@@ -194,7 +196,8 @@ def read_episode(path: Path, gaps: str) -> tuple[Episode, str]:
                 f"{gap}; rows of an episode are one period apart. --gaps=cut keeps what comes "
                 "before the first gap"
             )
-        episode = episode_of(reader.info, kept)
+        info = replace(reader.info, task=reader.info.task or UNKNOWN_TASK)
+        episode = episode_of(info, kept)
         episode.validate()
     except DataError as error:
         place = "" if str(error).startswith(str(path)) else f"{path}: "

@@ -6,6 +6,7 @@ Messages are JSON or ROS 2 (CDR).
 from __future__ import annotations
 
 import base64
+import errno
 import io
 import json
 import re
@@ -16,7 +17,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from mcap_ros2.decoder import DecoderFactory
@@ -27,6 +27,7 @@ from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError
 from egovcp.flags import read_config
 from egovcp.log.mcap_reader import require_mcap
+from egovcp.log.mcap_records import MCAP_ERRORS
 from egovcp.rate import NS_PER_S
 from egovcp.values import build
 
@@ -170,14 +171,14 @@ class TopicRecording:
 
     def _decode(self, schema: Schema | None, channel: Channel, message: Message) -> Any:
         kind = channel.message_encoding
-        decode = json.loads if kind == "json" else self._decoders.decoder_for(kind, schema)
-        if decode is None:
-            found = f"{kind} ({schema.name})" if schema else kind
-            raise DataError(f"{channel.topic} is {found}; expected JSON or ROS 2 (cdr)")
         try:
-            return decode(message.data)
-        except Exception as error:  # decoders raise many types on damaged messages
+            decode = json.loads if kind == "json" else self._decoders.decoder_for(kind, schema)
+            if decode is not None:
+                return decode(message.data)
+        except Exception as error:  # decoders raise many types on damaged schemas and messages
             raise DataError(f"{channel.topic} is damaged: {error!r}") from error
+        found = f"{kind} ({schema.name})" if schema else kind
+        raise DataError(f"{channel.topic} is {found}; expected JSON or ROS 2 (cdr)")
 
     def _messages(
         self, topics: set[str] | None
@@ -185,8 +186,10 @@ class TopicRecording:
         """The messages on the topics (None: all) in order of time."""
         try:
             with self.path.open("rb") as file:
-                yield from make_reader(file).iter_messages(topics)
-        except McapError as error:
+                yield from make_reader(file, validate_crcs=True).iter_messages(topics)
+        except (*MCAP_ERRORS, KeyError, RuntimeError, OSError) as error:  # RuntimeError: of lz4
+            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # of a damaged offset
+                raise
             raise DataError(
                 f"{self.path}: {error!r}; expected a complete MCAP file (`mcap recover`, of "
                 "Foxglove's command line, keeps what is readable)"

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from egovcp.bounds import bounded
-from egovcp.sim.tasks.base import Array, Task
+from egovcp.sim.tasks.base import PARKED, Array, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import ACTION_BOX
 
@@ -93,7 +93,7 @@ class ArchTask(Task):
 
     @classmethod
     def add_objects(cls, spec: mujoco.MjSpec) -> None:
-        body = spec.worldbody.add_body(name=ARCH, mocap=True, pos=[20, 0, 0])
+        body = spec.worldbody.add_body(name=ARCH, mocap=True, pos=PARKED)
         for name in _GEOMS:
             box = mujoco.mjtGeom.mjGEOM_BOX
             body.add_geom(name=name, type=box, size=[0.1, 0.1, 0.1], contype=1, conaffinity=0)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Array", "Task"]
 
 PHYSICS_STEPS_PER_TICK: Final = CONTROLLER_TICKS_PER_PLAN * PHYSICS_STEPS_PER_CONTROLLER_TICK
+PARKED: Final = (1000.0, 0.0, 0.0)  # m, of objects that wait far away; no robot walks there
 FALL_HEIGHT: Final = 0.40  # m, pelvis; the lowest command is 0.52
 FALL_TILT: Final = 1.0  # rad, pelvis; the deepest squat pitches it by 0.5
 
@@ -70,10 +71,11 @@ class Task(BaseTask):
 
     @classmethod
     def constant_actions(cls) -> list[tuple[float, ...]]:
-        """The poses of `constant_poses`, which are left-right symmetric."""
+        """The left-right symmetric poses of `constant_poses`, without the neutral one."""
         return [  # 0.0 - x, because -x of 0.0 is -0.0
             (forward, outward, up, forward, 0.0 - outward, up, height)
             for forward, outward, up, height in itertools.product(*cls.constant_poses)
+            if any((forward, outward, up, height))
         ]
 
     def process_contacts(self, contacts: Sequence[Contact]) -> None:

@@ -86,6 +86,7 @@ class BaseTask(ABC):
         tick = int(rng.integers(low, high + 1))
         empty = bool(rng.random() < episode.empty_probability)
         self.event_tick: int | None = None if empty else tick
+        self._geometry_rng = scenario.rng("geometry")
         self.ticks_limit = episode.ticks
         self.physics_steps = 0
         self.fallen = False
@@ -145,9 +146,9 @@ class BaseTask(ABC):
     def sample(self, *names: str) -> dict[str, float]:
         """Sample ``names`` uniformly from the config's ranges ``<name>_range``, in this order.
 
-        They are `parameters` of the episode.
+        They are `parameters` of the episode. Further calls continue the random stream.
         """
-        rng = self.scenario.rng("geometry")
+        rng = self._geometry_rng
         ranges = ((name, getattr(self.config, f"{name}_range")) for name in names)
         self.parameters |= {name: float(rng.uniform(*limits)) for name, limits in ranges}
         return self.parameters

@@ -164,7 +164,9 @@ def register_task(reference: str) -> str:
 
     Raises:
         UsageError: it cannot be imported, or is not a complete task; the message says why.
+        MissingPackage: the simulator is not installed.
     """
+    require_packages("egovcp", f"--task={reference}", *SIMULATOR_MODULES)
     folder = os.getcwd()
     if folder not in sys.path:
         sys.path.append(folder)

@@ -12,7 +12,7 @@ import numpy as np
 
 from egovcp.bounds import bounded
 from egovcp.sim.scene import HANDS, Contact
-from egovcp.sim.tasks.base import Array, Task
+from egovcp.sim.tasks.base import PARKED, Array, Task
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range, TaskConfig
 from egovcp.spec import PHYSICS_DT
 
@@ -58,7 +58,7 @@ class WallConfig(TaskConfig):
 
 def add_wall(spec: mujoco.MjSpec) -> None:
     """Add a wall as a mocap body; its origin is on the surface, its x axis points into it."""
-    body = spec.worldbody.add_body(name=WALL, mocap=True, pos=[20, 0, 0])
+    body = spec.worldbody.add_body(name=WALL, mocap=True, pos=PARKED)
     centre, box = [_HALF_SIZE[0], 0, _HALF_SIZE[2]], mujoco.mjtGeom.mjGEOM_BOX
     size = list(_HALF_SIZE)
     body.add_geom(name=WALL, type=box, size=size, pos=centre, contype=1, conaffinity=0, priority=1)

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from egovcp.errors import UsageError
 from egovcp_experiment.cell import Cell
-from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import (
     ablations,
     generalise,
@@ -32,6 +33,8 @@ class Experiment:
     """The line in ``egovcp-experiment --help``."""
     make: Callable[[Grid, Records], ExperimentReport]
     """Requests all cells from the grid, and reports those that have results."""
+    has_variants: bool = False
+    """Whether ``--only`` and ``--most`` choose variants."""
 
     def cells(self, config: ExperimentConfig) -> list[Cell]:
         """All cells, each after those it needs: what a report without results requests.
@@ -39,6 +42,10 @@ class Experiment:
         Raises:
             UsageError: an option is invalid for this experiment.
         """
+        most = config.most != SCALES[config.scale]().most
+        if not self.has_variants and (config.only or most):
+            option = "most" if most else "only"
+            raise UsageError(f"--{option}: this experiment has no variants to choose; omit it")
         grid = Grid(config)
         self.make(grid, {})
         return grid.cells
@@ -50,22 +57,28 @@ class Experiment:
 
 EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "ablations": Experiment(
-        "what each choice of the world model is worth on held-out episodes", ablations.report
+        "what each choice of the world model is worth on held-out episodes",
+        ablations.report,
+        has_variants=True,
     ),
     "generalise": Experiment(
         "unseen boxes, sizes, speeds, walls and arches; noise, delay and physics; several tasks in "
         "one episode (fig. 4a)",
         generalise.report,
+        has_variants=True,
     ),
     "interpret": Experiment(
         "value maps of a hand, open-loop images, and behaviour with and without events (fig. 7)",
         interpret.report,
+        has_variants=True,
     ),
     "multitask": Experiment(
         "one model on mixed data against one per task; t-SNE of h and z (fig. 6)", multitask.report
     ),
     "planners": Experiment(
-        "CEM, iCEM, MPPI and random shooting in equal time; termination rules", planners.report
+        "CEM, iCEM, MPPI and random shooting in equal time; termination rules",
+        planners.report,
+        has_variants=True,
     ),
     "ppo": Experiment(
         "PPO, the model-free baseline, along its training, next to the planner", ppo.report
@@ -76,6 +89,7 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "table1": Experiment(
         "horizons, ARWM, Rew-MPC and TD-MPC next to ours; tests of the paper's ordering (table I)",
         table1.report,
+        has_variants=True,
     ),
     "variance": Experiment(
         "do the errors of Q along a plan average out, and predict the best horizon "

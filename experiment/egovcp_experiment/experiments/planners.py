@@ -47,7 +47,9 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         rules = results.all_scores(records, rule_plays, task)
         timing = records.get(f"plan_time-{task}")
         if timing is not None:
-            page.sections.append(_timings(task, timing["figures"]["searches"], searches))
+            timed = timing["figures"]["searches"]
+            page.sections.append(_timings(task, timed, searches))
+            page.findings += _over_budget(task, timed, searches, config.play.budget_ms)
         for kind, scores, reference in (("searches", searches, "cem"), ("rules", rules, "default")):
             if scores:
                 title = f"{task}: {kind}"
@@ -85,6 +87,18 @@ def _timings(task: str, timed: Mapping[str, Any], played: Mapping[str, EvalScore
     ]
     head = ("search", "candidates", "iterations", "elites", "plan (ms)")
     return Table(f"{task}: searches in equal time", head, rows)
+
+
+def _over_budget(
+    task: str, timed: Mapping[str, Any], played: Mapping[str, EvalScores], budget_ms: float
+) -> list[str]:
+    slow = [f"`{n}` {timed[n]['plan_ms']:.1f} ms" for n in played if not timed[n]["within_budget"]]
+    if not slow:
+        return []
+    return [
+        f"{task}, searches: above {budget_ms:g} ms even with the fewest candidates: "
+        f"{', '.join(slow)}"
+    ]
 
 
 def _conclusions(

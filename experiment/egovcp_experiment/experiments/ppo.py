@@ -11,7 +11,7 @@ from typing import Final
 
 from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
-from egovcp.sim.config import evaluation_config
+from egovcp.sim.config import short_episodes
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
 from egovcp_experiment.grid import REFERENCES, Grid
@@ -49,10 +49,13 @@ def _training(grid: Grid, task: str, seed: int) -> Cell:
 
 
 def steps_per_episode(grid: Grid, task: str, records: results.Records) -> float:
-    """Planner ticks per episode of the collected data; the default for an existing dataset."""
+    """Planner ticks per episode of the data; the default of a collection without a result."""
     data = grid.data(task)
-    if isinstance(data, ExternalPath) or data.cell not in records:
-        return float(evaluation_config().episode(task).ticks)
+    if isinstance(data, ExternalPath):
+        episodes, transitions = grid.given_size(task)
+        return transitions / episodes
+    if data.cell not in records:
+        return float(short_episodes().episode(task).ticks)
     figures = records[data.cell]["figures"]
     return float(figures["steps"] / figures["episodes"])
 
@@ -84,14 +87,16 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ours = {} if planner is None else {_PLANNER: planner}
         shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **references}
         if ppo:
-            offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
+            offline = None  # unknown for a given policy
+            if task not in config.train.policies:
+                offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
             curves = [results.Curve("PPO", ppo, "C1", "x--")]
-            if planner is not None:
+            if planner is not None and offline is not None:
                 curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
             caption = f"{task}: success and reward against transitions"
             page.sections.append(results.learning_curves(task, caption, curves))
             page.findings += _conclusions(task, offline, planner, ppo, references)
-            page.figures[task] = {"planner_transitions": offline}
+            page.figures[task] = {} if offline is None else {"planner_transitions": offline}
         if shown:
             page.sections.append(results.comparison(task, shown, _PLANNER))
             page.figures.setdefault(task, {}).update(results.figures_of(shown))
@@ -100,7 +105,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
 
 def _conclusions(
     task: str,
-    offline: int,
+    offline: int | None,
     planner: EvalScores | None,
     ppo: Mapping[int, EvalScores],
     references: Mapping[str, EvalScores],
@@ -108,10 +113,11 @@ def _conclusions(
     count, last = list(ppo.items())[-1]
     lines = []
     if planner is not None:
+        seen = "" if offline is None else f" from {steps_text(offline)}"
         lines.append(
-            f"{task}: the planner {percent(planner.success_rate)} success from "
-            f"{steps_text(offline)}, PPO {percent(last.success_rate)} after {steps_text(count)}: "
-            f"PPO is {_versus(last, planner)}"
+            f"{task}: the planner {percent(planner.success_rate)} success{seen}, PPO "
+            f"{percent(last.success_rate)} after {steps_text(count)}: PPO is "
+            f"{_versus(last, planner)}"
         )
     if "hold" in references:
         versus = _versus(last, references["hold"])

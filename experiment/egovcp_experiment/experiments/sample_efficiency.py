@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.experiments.ppo import ppo_scores, steps_per_episode, steps_text
@@ -17,6 +18,10 @@ from egovcp_experiment.report import ExperimentReport, Part
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     grid.collected = max(1.0, *config.data.parts)
+    if grid.collected > 1 and config.data.roots:
+        raise UsageError(
+            f"--data.parts holds {grid.collected:g}: of a given dataset (--data.roots), at most 1"
+        )
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
         sections=[
@@ -62,7 +67,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
 
 def _model(grid: Grid, task: str, part: float) -> Model:
     """A model of the first episodes. That of all episodes is the default model of other
-    experiments, unless the user gave a policy or a dataset of unknown size."""
+    experiments, unless the user gave a policy or a dataset."""
     config, episodes = grid.config, grid.episodes(task, part)
     given = task in config.train.policies or task in config.data.roots
     whole = episodes == grid.episodes(task) == grid.episodes(task, grid.collected)

@@ -263,7 +263,11 @@ def _best_horizon(task: str, rows: Mapping[str, EvalScores]) -> str:
     if ours[best] is rows[OURS]:
         return text
     gain = ours[best].gain(rows[OURS])
-    return f"{text}, {gain.word('beyond', same='not beyond')} chance ({gain}, compared with N=4)"
+    word = gain.word("beyond", same="not beyond")
+    return (
+        f"{text}, {word} chance ({gain}, compared with N=4; chosen on the same scenarios, which "
+        "the interval does not account for)"
+    )
 
 
 def _summary(scores: Scores) -> Table:

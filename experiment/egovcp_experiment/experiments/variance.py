@@ -104,7 +104,8 @@ def _conclusions(
         lines.append(
             f"{task}: the mean square error is least at N = {predicted}; reward in closed loop is "
             f"best at N = {best}, by {gain.reward:+.5f} a step (95 % "
-            f"{signed_range(gain.reward_interval)}) compared with N = {predicted}: {word}"
+            f"{signed_range(gain.reward_interval)}; it does not account for the choice of the best "
+            f"on the same scenarios) compared with N = {predicted}: {word}"
         )
     return lines
 

@@ -109,7 +109,6 @@ def _affordable(
         "elites": min(planner.elites, samples // 2),  # docs/planner.md
         "plan_ms": few_ms + slope * (samples - _FEW),
         "within_budget": room >= _MULTIPLE,
-        "measured_ms": {str(_FEW): few_ms, str(_MANY): many_ms},
     }
 
 

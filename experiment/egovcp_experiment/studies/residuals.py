@@ -4,9 +4,10 @@
 
 Q^ is the model's value along an imagined plan. Q is the mean return of the data's random walk from
 there: the simulator is reset to the same state, follows the plan up to a_k, and continues with
-several random walks. With step_ticks > 1, the time to the walk's next step is sampled, too. The
-sampling variance of the mean is subtracted; errors of different k use different walks. So e_k is an
-error of Q only if Q was trained on such returns: with q_target=mc, on data of the same walk.
+several random walks. Returns weight the reward terms as those of the training (returns.weights).
+With step_ticks > 1, the time to the walk's next step is sampled, too. The sampling variance of the
+mean is subtracted; errors of different k use different walks. So e_k is an error of Q only if Q was
+trained on such returns: with q_target=mc, on data of the same walk.
 
     E[(J_N - J^_N)^2] = 1/N^2 sum_ij Cov[e_i, e_j] + bias^2
     V_ub = (N + rho (N^2 - N)) / N^2 sigma_max^2
@@ -18,6 +19,7 @@ There are two kinds of plans: the planner's own, which maximise Q^, and random o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -27,6 +29,7 @@ from tqdm import tqdm
 
 from egovcp.artifact import Artifact, returns_of
 from egovcp.bounds import bounded
+from egovcp.data import ReturnConfig
 from egovcp.errors import UsageError
 from egovcp.eval_scores import Array
 from egovcp.model import Carry, WorldModel
@@ -35,7 +38,7 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM
+from egovcp.spec import ACTION_DIM, REWARD_TERMS
 from egovcp.terminal import echo
 from egovcp_experiment.studies import study
 
@@ -144,7 +147,7 @@ def measure(config: ResidualsConfig) -> None:
     for number, start in enumerate(tqdm(starts, unit="plan", desc="branch")):
         for kind, plan in start.plans.items():
             rngs = np.random.default_rng([config.seed, number]).spawn(STEPS * config.branches)
-            simulated = _branches(config.env, start, plan, walk, rngs, returns.gamma, returns.steps)
+            simulated = _branches(config.env, start, plan, walk, rngs, returns)
             found.setdefault(kind, []).append((start.values[kind], *simulated))
     config.write(
         {
@@ -166,19 +169,32 @@ def _branches(
     plan: Array,
     walk: RandomWalk,
     rngs: Sequence[np.random.Generator],
-    gamma: float,
-    steps: int,
+    returns: ReturnConfig,
 ) -> tuple[Array, Array]:
-    """(STEPS, branches) returns over ``steps`` ticks, and to the end of the episode, from each step
-    of the plan on; each of (STEPS * branches) ``rngs`` makes one branch."""
+    """(STEPS, branches) returns over ``returns.steps`` ticks, and to the end of the episode, from
+    each step of the plan on; each of (STEPS * branches) ``rngs`` makes one branch."""
+    with closing(VectorEnv(env_config, len(rngs), render_depth=False)) as env:
+        return _returns(env, start, plan, walk, rngs, returns)
+
+
+def _returns(
+    env: VectorEnv,
+    start: _Start,
+    plan: Array,
+    walk: RandomWalk,
+    rngs: Sequence[np.random.Generator],
+    config: ReturnConfig,
+) -> tuple[Array, Array]:
     rows = len(rngs)
-    env = VectorEnv(env_config, rows, render_depth=False)
     env.reset([start.scenario] * rows)
     for action in start.sent:
         env.step(np.tile(action, (rows, 1)))
     own = np.repeat(np.arange(STEPS), rows // STEPS)  # the step of the plan that a row measures
     short, whole = np.zeros(rows), np.zeros(rows)
     walk.start_at(np.zeros((rows, ACTION_DIM)), rngs)
+    of_column = dict(zip(REWARD_TERMS, config.term_weights, strict=True))
+    columns = env.instances[0].task.reward_terms
+    weights = {name: of_column[column] for name, column in columns.items()}
     age = 0
     while not env.done.all():
         over = np.flatnonzero(own == age - 1)
@@ -186,13 +202,13 @@ def _branches(
         action = walk.act(env)
         planned = own >= age
         action[planned] = plan[min(age, STEPS - 1)]
-        reward = env.step(action).reward
+        terms = env.step(action).reward_terms
+        reward = sum(weights[name] * values for name, values in terms.items())
         since = age - own
-        discount = np.where(since >= 0, gamma ** np.maximum(since, 0), 0.0)
+        discount = np.where(since >= 0, config.gamma ** np.maximum(since, 0), 0.0)
         whole += discount * reward
-        short += np.where(since < steps, discount, 0.0) * reward
+        short += np.where(since < config.steps, discount, 0.0) * reward
         age += 1
-    env.close()
     return short.reshape(STEPS, -1), whole.reshape(STEPS, -1)
 
 

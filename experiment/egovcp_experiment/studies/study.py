@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import batched
 from pathlib import Path
@@ -156,15 +157,16 @@ def play_episodes(
     scenarios = [Scenario(config.task, STUDIES + config.seed, i) for i in range(config.episodes)]
     with tqdm(total=len(scenarios), unit="ep", desc=f"play {config.task}") as bar:
         for group in batched(scenarios, _ENVS):
-            env = VectorEnv(env_config, len(group))
-            policy = artifact.make_policy(len(group), config.seed)
-            observation = env.reset(group)
-            while not env.done.all():
-                decision = policy.act(observation.depth, observation.state)
-                live = [int(row) for row in np.flatnonzero(~env.done)]
-                before = (env.privileged_state(), policy.carry.map(torch.clone), np.array(env.tick))
-                result = env.step(decision.action)
-                policy.advance(result.sent_action)
-                yield PlayedStep(group, env, *before, live, observation, decision, result)
-                observation = result.observation
+            with closing(VectorEnv(env_config, len(group))) as env:
+                policy = artifact.make_policy(len(group), config.seed)
+                observation = env.reset(group)
+                while not env.done.all():
+                    decision = policy.act(observation.depth, observation.state)
+                    live = [int(row) for row in np.flatnonzero(~env.done)]
+                    carry, tick = policy.carry.map(torch.clone), np.array(env.tick)
+                    before = (env.privileged_state(), carry, tick)
+                    result = env.step(decision.action)
+                    policy.advance(result.sent_action)
+                    yield PlayedStep(group, env, *before, live, observation, decision, result)
+                    observation = result.observation
             bar.update(len(group))

@@ -174,3 +174,41 @@ def test_the_example_cards_are_valid(task: str) -> None:
     found = IMAGE.findall(path.read_text())
     assert len(found) == 4
     assert all((path.parent / picture).is_file() for picture in found)
+
+
+def test_a_merged_dataset_shows_the_settings_of_all_parts(tmp_path: Path) -> None:
+    """Both walks are the same; noise and seeds differ."""
+    env, folders = SETTINGS.config["env"], []
+    for seed, hands in ((5, 0.01), (6, 0.02)):
+        part = {**SETTINGS.config, "env": {**env, "pose_cost": hands}}
+        known = Provenance("stance-1", seed=seed, config=part)
+        folders.append(str(write(tmp_path / f"{seed}", [seed], known)))
+    merged = str(tmp_path / "merged")
+    assert main(["merge", *folders, f"--output_dir={merged}"]) == 0
+    text = card_text(DatasetReader.open(DatasetConfig(root=merged)), "me/merged")
+    assert "| seed | 5, 6 |\n" in text
+    assert "a[t] = a[t-1] + 1.0 d with d uniform" in text
+    assert "The dataset was merged. Settings that are not the same" in text
+    assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
+    assert "env.pose_cost" not in text
+
+
+def test_a_walk_that_is_not_that_of_all_parts_is_not_described(tmp_path: Path) -> None:
+    folders = [
+        str(write(tmp_path / f"{eta}", [n], Provenance("stance-1", seed=n, config={"eta": eta})))
+        for n, eta in enumerate((0.3, 1.0))
+    ]
+    assert main(["merge", *folders, f"--output_dir={tmp_path / 'merged'}"]) == 0
+    reader = DatasetReader.open(DatasetConfig(root=str(tmp_path / "merged")))
+    text = card_text(reader, "me/merged")
+    assert "The behaviour policy is not the same in all parts, or is not recorded. The base" in text
+    assert "d uniform" not in text
+
+
+def test_only_a_complete_collection_repeats_from_its_seed(sound: Path, tmp_path: Path) -> None:
+    sentence = "| seed | 5; episode i is a function of the seed and i alone |"
+    assert sentence in card_text(DatasetReader.open(DatasetConfig(root=str(sound))), "me/six")
+    less = str(tmp_path / "less")
+    assert main(["delete", str(sound), "--episodes=[0]", f"--output_dir={less}"]) == 0
+    text = card_text(DatasetReader.open(DatasetConfig(root=less)), "me/five")
+    assert "| seed | 5 |\n" in text

@@ -63,8 +63,9 @@ def test_json_replaces_an_existing_file(root: Path, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["c.json"]
 
 
-def test_four_plots_are_drawn(root: Path, tmp_path: Path) -> None:
-    assert main(["coverage", str(root), f"--output_dir={tmp_path / 'new'}"]) == 0
+def test_four_plots_are_drawn(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert main(["coverage", str(root), "--output_dir=~/new"]) == 0
     drawn = sorted(p.name for p in (tmp_path / "new").iterdir())
     assert drawn == ["actions.png", "depth.png", "events.png", "returns.png"]
     for path in (tmp_path / "new").iterdir():

@@ -47,6 +47,15 @@ def test_every_complete_tick_of_a_torn_file_is_recovered(record: Record, tmp_pat
         assert torn.read_bytes() == content[:cut]
 
 
+def test_the_home_folder_is_expanded(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    record("whole.mcap")
+    assert main(["recover", "~/whole.mcap", "~/out.mcap"]) == 0
+    assert main(["info", "~/out.mcap"]) == 0
+
+
 def test_a_recovered_file_has_an_index(record: Record, tmp_path: Path) -> None:
     whole, torn = record(), tmp_path / "torn.mcap"
     torn.write_bytes(whole.read_bytes()[: chunk_ends(whole)[4] + 100])

@@ -76,6 +76,14 @@ def test_a_rollout_of_any_task_becomes_an_episode_of_it(record: Record, tmp_path
     assert open_dataset(tmp_path / "new").read(0).task == "juggle"
 
 
+def test_a_rollout_without_a_task_becomes_an_episode_of_an_unknown_one(
+    record: Record, tmp_path: Path
+) -> None:
+    file = record(info=replace(INFO, task=""))
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 0
+    assert open_dataset(tmp_path / "new").task(0) == "unknown"
+
+
 def test_different_controllers_are_refused(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

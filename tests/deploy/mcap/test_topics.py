@@ -15,9 +15,11 @@ from lerobot.datasets import LeRobotDataset
 from mcap.writer import Writer
 from PIL import Image
 
+from egovcp.errors import DataError
 from egovcp.log.ros2 import definition, image_16uc1
 from egovcp_collect.dataset.cli import main as dataset_command
 from egovcp_deploy.mcap.cli import main
+from egovcp_deploy.mcap.topics import TopicMapping, TopicRecording
 
 RATE_HZ, FRAMES = 20, 30
 COLOURS = np.random.default_rng(0).integers(0, 255, (FRAMES, 24, 32, 3), np.uint8)
@@ -178,3 +180,23 @@ def test_a_torn_file_is_refused(
     file.write_bytes(file.read_bytes()[:-2000])
     assert _convert(tmp_path, [file]) == 3
     assert "expected a complete MCAP file" in capsys.readouterr().err
+
+
+def test_a_damaged_file_is_refused_or_gives_the_same_rows(foreign: Foreign, tmp_path: Path) -> None:
+    mapping = TopicMapping(RATE_HZ, "pick", FEATURES, hold=["/gripper"])
+
+    def rows(path: Path) -> list[dict[str, bytes]]:
+        found = TopicRecording(path, mapping).rows({})
+        return [{key: value.tobytes() for key, value in row.items()} for row in found]
+
+    path = foreign()
+    whole, expected, refused = path.read_bytes(), rows(path), 0
+    places = [*range(20, len(whole), len(whole) // 50), len(whole) - 308, len(whole) - 21]
+    for place in places:
+        damaged = tmp_path / "damaged.mcap"
+        damaged.write_bytes(whole[:place] + bytes([whole[place] ^ 0x91]) + whole[place + 1 :])
+        try:
+            assert rows(damaged) == expected, place
+        except DataError:
+            refused += 1
+    assert refused > len(places) / 2

@@ -9,13 +9,17 @@ import pytest
 
 import egovcp.sim.config as sim_config
 import egovcp.sim.tasks.registry as registry
+from egovcp import packages
 from egovcp.checks import ConformanceError, check_task
 from egovcp.entry_point import EntryPoint
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.packages import MissingPackage
 from egovcp.sim.base_env import Observation
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Oracle
+from egovcp.sim.robot_env import controller_id_of, make_env
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import build_scene
 from egovcp.sim.tasks import find_task, register_task, task_entries, task_names
 from tests.support.plugins import install
 
@@ -330,3 +334,60 @@ class ArmTask(PostTask):
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(UsageError, match="its robot is not the G1; derive it from"):
         register_task("arm_tasks:ArmTask")
+
+
+def test_a_reference_without_the_simulator_names_the_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "mujoco")
+    monkeypatch.setattr(registry, "is_installed", lambda name: name != "mujoco")
+    monkeypatch.setattr(registry, "_found", None)
+    with pytest.raises(MissingPackage, match="--task=post_task:PostTask needs mujoco"):
+        register_task("post_task:PostTask")
+
+
+@pytest.mark.usefixtures("post")
+def test_further_samples_continue_the_random_stream() -> None:
+    env = VectorEnv(sim_config.EnvConfig(), 1)
+    env.reset([Scenario("post", 0, 0)])
+    first = env.parameters[0]["distance"]
+    assert env.instances[0].task.sample("distance")["distance"] != first
+
+
+def test_objects_with_names_like_parts_of_the_robot_are_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed(
+        tmp_path, monkeypatch, 'body.add_geom(name="post"', 'body.add_geom(name="a_foot_collision"'
+    )
+    index = build_scene((find_task("post"),), "points").index
+    (post,) = index.objects["post"]
+    assert index.part[post] == -1
+    assert post not in index.foot_geoms
+
+
+def test_robots_of_equal_specification_and_other_classes_are_not_mixed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their low-level control differs."""
+    source = """
+from arm_task import PlanarArm, ReachTask
+
+class OtherArm(PlanarArm):
+    control_id = "other"
+
+class OtherTask(ReachTask):
+    name = "other_reach"
+    robot_class = OtherArm
+"""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "examples" / "robots" / "arm"))
+    install(tmp_path, "other", source, "other_reach = other_task:OtherTask", monkeypatch)
+    register_task("arm_task:ReachTask")
+    tasks = ("arm_reach", "other_reach")
+    config = sim_config.EnvConfig()
+    message = "robot_class of task other_reach is OtherArm, expected PlanarArm"
+    with pytest.raises(UsageError, match=message):
+        controller_id_of(config, tasks)
+    env = make_env(config, 2, tasks[:1])
+    with pytest.raises(UsageError, match=message):
+        env.reset([Scenario(task, 0, 0) for task in tasks])

@@ -10,8 +10,14 @@ from typing import Any
 import pytest
 
 from egovcp.errors import UsageError
+from egovcp.files import write_json
 from egovcp_experiment.cell import PPO_POLICY, TRAIN_PPO, CellOutput
-from egovcp_experiment.config import ExperimentConfig, PpoBaselineConfig, TrainingConfig
+from egovcp_experiment.config import (
+    DataConfig,
+    ExperimentConfig,
+    PpoBaselineConfig,
+    TrainingConfig,
+)
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.store import CellStore
 
@@ -100,8 +106,8 @@ def played(name: str, success: int, reward: float) -> Mapping[str, Any]:
     return {name: {"plan_ms_p50": 1.0, "played": columns}}
 
 
-def test_conclusions_follow_from_the_scores() -> None:
-    records = {
+def results() -> dict[str, Mapping[str, Any]]:
+    return {
         "collect-ball-5400": {"figures": {"episodes": 5400, "steps": 200_100}},
         "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
         "play-ball-ppo_500-s3": {"figures": {"ball": played("ppo", 5, 0.2)}},
@@ -116,7 +122,10 @@ def test_conclusions_follow_from_the_scores() -> None:
             }
         },
     }
-    findings = PPO.report(CONFIG, records).findings
+
+
+def test_conclusions_follow_from_the_scores() -> None:
+    findings = PPO.report(CONFIG, results()).findings
     assert findings[0].startswith(
         "ball: the planner 90.0 % success from 200k steps, PPO 50.0 % after 1000 steps: PPO is "
         "worse (reward per step -0.08000, 95 % -0.08000 to -0.08000; success -40.0 points"
@@ -127,3 +136,19 @@ def test_conclusions_follow_from_the_scores() -> None:
     assert findings[2].startswith(
         "ball: compared with its first policy, PPO's last is no different beyond"
     )
+
+
+def test_the_transitions_of_a_given_dataset_are_counted(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    write_json(tmp_path / "meta" / "info.json", {"total_episodes": 40, "total_frames": 3210})
+    config = replace(CONFIG, data=DataConfig(roots={"ball": str(tmp_path)}))
+    found = PPO.report(config, results())
+    assert found.figures["ball"]["planner_transitions"] == 3210
+    assert found.findings[0].startswith("ball: the planner 90.0 % success from 3210 steps, PPO")
+
+
+def test_the_transitions_of_a_given_policy_are_unknown() -> None:
+    config = replace(CONFIG, train=replace(CONFIG.train, policies={"ball": "a/ball"}))
+    found = PPO.report(config, results())
+    assert "planner_transitions" not in found.figures["ball"]
+    assert found.findings[0].startswith("ball: the planner 90.0 % success, PPO 50.0 % after 1000")

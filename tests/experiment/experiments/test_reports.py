@@ -14,6 +14,7 @@ from egovcp_experiment.cell import ARTIFACT, COLLECT, PLAY, Cell, CellOutput
 from egovcp_experiment.config import SCALES
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report import ExperimentReport, Plot, Table
+from egovcp_experiment.studies.plan_time import SEARCHES
 
 _PARTS = "env.sequence.parts"
 
@@ -190,3 +191,13 @@ def test_ablations_name_the_best_choice() -> None:
     assert rows["default"]["Q R2"] == "0.3 ± 0.1"
     assert rows["default"]["moving, 8 (x)"] == "4 ± 0"
     assert rows["td"]["AUC within 5"] == "-"
+
+
+def test_searches_above_the_time_budget_are_named() -> None:
+    row = {"samples": 32, "iterations": 3, "elites": 16, "plan_ms": 5.0, "within_budget": True}
+    slow = {"cem_6": {**row, "plan_ms": 15.2, "within_budget": False}}
+    timing = {"figures": {"searches": dict.fromkeys(SEARCHES, row) | slow}}
+    found = {**records("planners", 1.0), "plan_time-ball": timing}
+    findings = EXPERIMENTS["planners"].report(SCALES["small"](), found).findings
+    over = [line for line in findings if "fewest candidates" in line]
+    assert over == ["ball, searches: above 12 ms even with the fewest candidates: `cem_6` 15.2 ms"]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from egovcp.errors import UsageError
+from egovcp.files import write_json
 from egovcp_experiment.cell import TRAIN
 from egovcp_experiment.config import (
     DataConfig,
@@ -47,7 +51,7 @@ def test_more_data_is_judged_by_reward(reward: float, words: str) -> None:
     ]
     records = {half: played(0.2, 0.9), whole: played(reward, 0.7)}
     (line,) = EXPERIMENTS["sample-efficiency"].report(CONFIG, records).findings
-    assert line.startswith("wall: 90.0% success from 300k steps, 70.0% from 600k steps: " + words)
+    assert line.startswith("wall: 90.0% success from 200k steps, 70.0% from 400k steps: " + words)
     assert f"reward per step {reward - 0.2:+.5f}, 95 % " in line
     assert "success -20.0 points, " in line
 
@@ -67,3 +71,20 @@ def test_a_given_policy_is_not_the_model_of_all_episodes() -> None:
     cells = EXPERIMENTS["sample-efficiency"].cells(config)
     trained = [cell.name for cell in cells if cell.command is TRAIN]
     assert trained == ["train-ball-first_5400-s0", "train-wall-default-s0"]
+
+
+def test_parts_are_those_of_a_given_dataset(tmp_path: Path) -> None:
+    info = {"total_episodes": 1000, "total_frames": 80_000}
+    (tmp_path / "meta").mkdir()
+    write_json(tmp_path / "meta" / "info.json", info)
+    roots = {"wall": str(tmp_path)}
+    config = replace(CONFIG, data=replace(CONFIG.data, roots=roots))
+    cells = EXPERIMENTS["sample-efficiency"].cells(config)
+    parts = [c.flags["dataset.episodes"] for c in cells if c.command is TRAIN]
+    assert parts == ["0:500", "0:1000"]
+    records = {c.name: played(0.2, 0.5) for c in cells if c.name.startswith("play-")}
+    (line,) = EXPERIMENTS["sample-efficiency"].report(config, records).findings
+    assert line.startswith("wall: 50.0% success from 40k steps, 50.0% from 80k steps")
+    more = replace(config, data=replace(config.data, parts=(1.0, 2.0)))
+    with pytest.raises(UsageError, match=r"--data\.parts holds 2"):
+        EXPERIMENTS["sample-efficiency"].cells(more)

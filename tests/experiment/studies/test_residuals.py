@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egovcp.data import ReturnConfig
 from egovcp.policy_options import PolicyOptions
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.policies import RandomWalk
@@ -30,11 +31,12 @@ def _config(ticks: int) -> EnvConfig:
 
 
 def _branch(
-    ticks: int, steps: int, plan: np.ndarray, walk: RandomWalk
+    ticks: int, steps: int, plan: np.ndarray, walk: RandomWalk, pose_weight: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     point = _Start(Scenario("ball", 0, 0), [np.zeros(7)] * 2, {}, {})
     rngs = np.random.default_rng(0).spawn(2 * STEPS)
-    return _branches(_config(ticks), point, plan, walk, rngs, 0.5, steps)
+    returns = ReturnConfig(gamma=0.5, steps=steps, weights={"pose": pose_weight})
+    return _branches(_config(ticks), point, plan, walk, rngs, returns)
 
 
 def test_returns_start_at_the_action_of_each_step() -> None:
@@ -44,6 +46,14 @@ def test_returns_start_at_the_action_of_each_step() -> None:
     np.testing.assert_allclose(short, np.repeat(-0.01 * plan[:, :1] ** 2, 2, axis=1), rtol=1e-9)
     np.testing.assert_allclose(whole[-1], short[-1])  # the episode ends with the plan
     assert (whole[:-1] < short[:-1]).all()
+
+
+def test_returns_weight_the_reward_terms_as_in_training() -> None:
+    plan = np.repeat(np.linspace(0.1, 0.3, STEPS)[:, None], 7, axis=1)
+    short, _ = _branch(2 + STEPS, 1, plan, RandomWalk(), pose_weight=3.0)
+    np.testing.assert_allclose(short, np.repeat(-0.03 * plan[:, :1] ** 2, 2, axis=1), rtol=1e-9)
+    _, whole = _branch(2 + STEPS, 1, plan, RandomWalk(), pose_weight=0.0)
+    assert not whole.any()
 
 
 def test_walks_differ_after_the_plan() -> None:

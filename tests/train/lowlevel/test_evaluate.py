@@ -156,8 +156,11 @@ def test_stepping_is_the_share_of_the_ticks_up_to_a_fall_in_which_it_steps():
         assert ((low <= share) & (share <= high)).all(), (name, share)
 
 
-def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    flags = [f"--output_dir={tmp_path / 'out'}", "--skills=squat", "--episodes=2", "--threads=1"]
+def test_it_writes_a_line_per_skill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    flags = ["--output_dir=~/out", "--skills=squat", "--episodes=2", "--threads=1"]
     assert main(flags) == 0
     figures = json.loads((tmp_path / "out" / "lowlevel.json").read_text())
     assert figures["squat"]["episodes"] == 2

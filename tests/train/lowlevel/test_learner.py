@@ -1,5 +1,7 @@
 """Start from a trained controller, and the warm-up of the critic."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -50,6 +52,24 @@ def test_the_warm_up_trains_the_critic_and_keeps_the_noise():
     assert all(s["ppo/symmetric_error"] < 0.1 for s in scalars)
     assert scalars[-1]["ppo/action_std"] == pytest.approx(NetworkConfig().initial_std)
     assert scalars[-1]["ppo/learning_rate"] == RslRlPpoConfig().learning_rate
+
+
+def test_a_warm_up_that_is_resumed_goes_on():
+    policy = load_walk_policy("walk")
+    learner = _learner(2)
+    learner.start_from(policy)
+    learner.iterate()
+    state = copy.deepcopy(learner.state_dict())
+    resumed = _learner(2)
+    resumed.start_from(policy, resumed=True)
+    resumed.load_state_dict(state)
+    assert torch.equal(torch.get_rng_state(), state["torch_rng"])
+    old, new = (each.ppo.get_policy().mlp.parameters() for each in (learner, resumed))
+    assert all(torch.equal(a, b) for a, b in zip(old, new, strict=True))
+    moments = resumed._start.optimizer.state_dict()["state"]
+    assert all(each["step"] > 0 for each in moments.values())
+    assert "ppo/symmetric_error" in resumed.iterate()
+    assert "start_optimizer" not in resumed.state_dict()
 
 
 def test_the_actor_becomes_symmetric():

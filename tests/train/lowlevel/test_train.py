@@ -20,7 +20,12 @@ from egovcp_train.lowlevel.config import (
     RewardConfig,
 )
 from egovcp_train.lowlevel.env import LowLevelEnv
-from egovcp_train.lowlevel.learner import LowLevelLearner, next_difficulty, walk_policy
+from egovcp_train.lowlevel.learner import (
+    LowLevelLearner,
+    SymmetricStart,
+    next_difficulty,
+    walk_policy,
+)
 from egovcp_train.lowlevel.train import main
 from egovcp_train.on_policy import RslRlPpoConfig
 
@@ -59,6 +64,17 @@ def test_a_run_from_a_controller_takes_its_parameters_unless_they_are_given(tmp_
     assert found.balance == replace(shipped.balance, height_speed=0.3)
 
 
+def test_a_run_resumed_in_the_warm_up_of_the_critic_still_fits_the_actor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    fitted = []
+    monkeypatch.setattr(SymmetricStart, "fit", lambda *args: fitted.append(1) or 0.0)
+    flags = ["--init=walk", "--network.actor=[256,128,64]", "--critic_warmup=2", *SMALL]
+    assert main([f"--output_dir={tmp_path / 'run'}", "--steps=64", *flags]) == 0
+    assert main([f"--output_dir={tmp_path / 'run'}", "--resume", "--steps=192"]) == 0
+    assert len(fitted) == 2
+
+
 def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]):
     assert main([f"--output_dir={run}", "--resume", "--steps=320"]) == 0
     assert "done after 320 steps" in capsys.readouterr().out
@@ -70,6 +86,7 @@ def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[st
     [
         (["--robots=0"], 2, "--robots"),
         (["--robot=8"], 2, "robot"),
+        (["--task.episode=0.005"], 2, "--task.episode=0.005"),
         (["--resume"], 4, "no checkpoint to resume from"),
     ],
 )

@@ -24,7 +24,7 @@ class CommandConfig:
     forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.8)), least=-3, most=3)
     """Speed forwards, m/s, easy and hard."""
     backward: float = bounded(0.15, least=0, most=1)
-    """Share of the walking commands that go backwards."""
+    """Share of the walking commands that are not in place (`in_place`) that go backwards."""
     backward_speed: tuple[Range, Range] = bounded(((0.1, 0.15), (0.1, 0.35)), least=0, most=3)
     """Speed backwards, m/s, easy and hard."""
     in_place: float = bounded(0.25, least=0, most=1)
@@ -116,7 +116,7 @@ class LowLevelTask:
     """Pushes, physical parameters and delay."""
     rewards: RewardConfig = field(default_factory=RewardConfig)
     """Weights of the reward terms."""
-    episode: float = bounded(20.0, above=0)
+    episode: float = bounded(20.0, least=0.02, most=3600)
     """Longest episode, s."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -91,7 +92,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     if config.videos:
         require_packages("egovcp-train", "--videos", "matplotlib", "rerun")
     controller = make_controller(config.controller)
-    output = Path(config.output_dir)
+    output = Path(os.path.expanduser(config.output_dir))
     require_writable(output)
     figures: dict[str, dict[str, Any]] = {}
     complete = False
@@ -130,7 +131,7 @@ def _play_all(
 
     recorders: dict[str, Any] = {}
     if config.videos:
-        folder = Path(config.output_dir)
+        folder = Path(os.path.expanduser(config.output_dir))
         folder.mkdir(parents=True, exist_ok=True)
         recorders = {skill.name: SkillRecorder(skill.name, folder) for skill in skills}
     threads = config.threads or available_cores()

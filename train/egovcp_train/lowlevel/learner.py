@@ -93,13 +93,16 @@ class LowLevelLearner(OnPolicyLearner):
         self._seen: list[Tensor] = []
         env.logic.difficulty = curriculum.start
 
-    def start_from(self, policy: WalkPolicy) -> None:
-        """Initialise the actor with the network of a trained controller.
+    def start_from(self, policy: WalkPolicy, resumed: bool = False) -> None:
+        """Initialise the actor with the network of a trained controller; see `SymmetricStart`.
+
+        Args:
+            resumed: the run is resumed within the warm-up; `load_state_dict` restores the actor.
 
         Raises:
             UsageError: its layers have other sizes.
         """
-        self._start = SymmetricStart(self.ppo.get_policy(), policy)
+        self._start = SymmetricStart(self.ppo.get_policy(), policy, copy=not resumed)
 
     def update(self) -> dict[str, float]:
         """One update; in the first iterations of the critic alone, if so configured."""
@@ -137,11 +140,22 @@ class LowLevelLearner(OnPolicyLearner):
         return scalars
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"difficulty": self.env.logic.difficulty}
+        state = super().state_dict() | {
+            "difficulty": self.env.logic.difficulty,
+            "torch_rng": torch.get_rng_state(),
+        }
+        if self._start is not None and self.iteration < self._critic_warmup:
+            state["start_optimizer"] = self._start.optimizer.state_dict()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
         self.env.logic.difficulty = float(state["difficulty"])
+        # earlier versions did not store these
+        if "torch_rng" in state:
+            torch.set_rng_state(state["torch_rng"])
+        if self._start is not None and "start_optimizer" in state:
+            self._start.optimizer.load_state_dict(state["start_optimizer"])
         self.env.reseed(self.iteration)
 
 
@@ -157,17 +171,18 @@ class SymmetricStart:
     on the observations of the first iterations, in which only the critic learns from rewards.
     """
 
-    def __init__(self, actor: Any, policy: WalkPolicy) -> None:
-        """Copy network and normalisation.
+    def __init__(self, actor: Any, policy: WalkPolicy, copy: bool = True) -> None:
+        """With ``copy``, copy network and normalisation.
 
         Raises:
             UsageError: the network has layers of other sizes than the actor.
         """
-        _copy(actor, policy)
+        if copy:
+            _copy(actor, policy)
         self._actor = actor
         self._mean, self._std = torch.from_numpy(policy.mean), torch.from_numpy(policy.std)
         self._layers = [(torch.from_numpy(w), torch.from_numpy(b)) for w, b in policy.layers]
-        self._optimizer = torch.optim.Adam(actor.mlp.parameters(), _LEARNING_RATE)
+        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), _LEARNING_RATE)
 
     def fit(self, env: Any, observations: Tensor) -> float:
         """One pass over observations (N, 95) and their mirror images; returns the RMS error."""
@@ -182,9 +197,9 @@ class SymmetricStart:
         total = 0.0
         for rows in torch.split(torch.randperm(2 * n), _BATCH):
             loss = (self._actor(both[rows]) - target[rows]).square().mean()
-            self._optimizer.zero_grad()
+            self.optimizer.zero_grad()
             loss.backward()
-            self._optimizer.step()
+            self.optimizer.step()
             total += loss.item() * len(rows)
         return float((total / (2 * n)) ** 0.5)
 

@@ -111,8 +111,9 @@ def train(config: LowLevelTrainConfig) -> None:
     threads = config.threads or available_cores()
     torch.set_num_threads(threads)
     torch.manual_seed(config.seed)
-    init = load_walk_policy(config.init) if config.init and not config.resume else None
     state = load_training_state(output) if config.resume else {}
+    starts = not config.resume or int(state.get("iteration", 0)) < config.critic_warmup
+    init = load_walk_policy(config.init) if config.init and starts else None
     learner = _build(config, threads)
 
     def final_message(folder: Path, outcome: str) -> str:
@@ -125,7 +126,7 @@ def train(config: LowLevelTrainConfig) -> None:
 
     with contextlib.closing(learner.env):
         if init is not None:
-            learner.start_from(init)
+            learner.start_from(init, resumed=config.resume)
         write_policy = partial(_write_policy, config, learner)
         run_iterations(learner, config, output, state, write_policy, _summary, final_message)
 

@@ -46,7 +46,8 @@ class PpoTrainConfig:
     task: str = DEFAULT_TASK
     """One of `egovcp-task list`, package.module:Class, several in turn as ball,wall, or all."""
     env: EnvConfig = field(default_factory=EnvConfig)
-    """Scenes, sensors, delays and randomisation; the defaults are those of egovcp-collect."""
+    """Scenes, sensors, delays and randomisation. By default, episodes of ball and wall are longer
+    than those of egovcp-collect."""
     network: ReactiveConfig = field(default_factory=ReactiveConfig)
     """Policy and critic."""
     initial_std: float = bounded(0.4, above=0)
