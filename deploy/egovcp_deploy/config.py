@@ -20,12 +20,14 @@ class OperatorOptions:
     """Source of the requests to stand, arm, run, hold and stop; the remote control of a G1 works in
     addition."""
 
-    type: Literal["auto", "keyboard"] = "auto"
-    """auto: stands up, arms and runs by itself; keyboard: the keys of this terminal."""
+    type: Literal["remote", "keyboard", "auto"] = "remote"
+    """remote: only the robot's remote control starts it; keyboard: the keys of this terminal; auto:
+    stands up, arms and runs by itself, for egovcp-fake-g1."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Velocity of auto while running: vx, vy (m/s), yaw rate (rad/s)."""
     duration: float = bounded(0.0, least=0)
-    """How long auto runs before it holds and ends, s; 0: until interrupted."""
+    """Time from RUN until the robot is held and the run ends, s; 0: until interrupted. Not for
+    keyboard."""
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,11 @@ class DelayedPlanner:
         self._waiting: deque[ObservationMessage] = deque(maxlen=BACKLOG)
         self._ready: tuple[int, PlanMessage] | None = None
 
-    def submit(self, observation: ObservationMessage) -> None:
+    def submit(self, observation: ObservationMessage) -> bool:
         """Send o_t; an idle planner begins at once."""
         self._waiting.append(observation)
         self._begin(observation.time_ns)
+        return True
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         """Plans that are due by ``now_ns``."""

@@ -3,7 +3,7 @@
 It owns the connection to the robot. If the planner's process ends or hangs, the robot is held.
 On a normal exit, an exception or a signal that can be handled its last commands damp the motors. If
 it is killed, the watchdog of the planner's process does; if both are gone, the motors keep the last
-command.
+command. A robot that it has never commanded is not damped: another program may balance it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from contextlib import closing, suppress
+from ctypes import c_bool
 from typing import Final
 
 from egovcp.errors import EgovcpError
@@ -46,10 +47,14 @@ _DAMPING_PERIOD_NS: Final = 5_000_000
 _SWITCH_S: Final = 0.001  # longest wait of the loop for a receiving thread
 
 
-def control_process(options: RobotOptions, address: str, parent: int) -> None:
+def control_process(
+    options: RobotOptions, address: str, parent: int, commanded: c_bool | None = None
+) -> None:
     """Main function of the process; returns on a quit command, on SIGTERM, SIGHUP or SIGQUIT, or
     2 s after the planner's process ``parent`` has ended, once the motors are damped. ``address`` is
-    that of the link between them."""
+    that of the link between them; ``commanded``, in shared memory, becomes true with the first
+    motor command."""
+    commanded = c_bool(False) if commanded is None else commanded
     os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
     with stop_on_signal(signals=_STOP_SIGNALS, interrupt=False) as stopping:
@@ -64,20 +69,29 @@ def control_process(options: RobotOptions, address: str, parent: int) -> None:
             sys.exit(error.exit_code)
         with closing(hardware), closing(Link(address, serve=False)) as link:
             try:
-                control = ControlProcess(options, parent, hardware, link)
+                control = ControlProcess(options, parent, hardware, link, commanded)
                 if not raise_priority(CONTROL_PRIORITY):
                     control.add_event(f"warning: {NO_PRIORITY}")
                 gc.freeze()  # imported objects are not searched for garbage again
                 control.run(stopping)
             finally:
-                damp_motors(hardware.body)
+                if commanded.value:
+                    damp_motors(hardware.body)
 
 
 class ControlProcess:
-    """The control loop with its inputs: operator commands, remote control, parent process."""
+    """The control loop with its inputs: operator commands, remote control, parent process;
+    ``commanded`` as in `control_process`."""
 
-    def __init__(self, options: RobotOptions, parent: int, hardware: Hardware, link: Link) -> None:
-        self._parent = parent
+    def __init__(
+        self,
+        options: RobotOptions,
+        parent: int,
+        hardware: Hardware,
+        link: Link,
+        commanded: c_bool,
+    ) -> None:
+        self._parent, self._commanded = parent, commanded
         self._body = hardware.body
         self._planner = RemotePlanner(link)
         self._loop = ControlLoop(
@@ -107,6 +121,7 @@ class ControlProcess:
             if (reading := self._body.read()) is not None:
                 commands += self._remote.commands(reading.remote)
             self._loop.tick(now, merged(commands))
+            self._commanded.value = self._loop.commanding
             self._check_parent()
             rate.wait()
 

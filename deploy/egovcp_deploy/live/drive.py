@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import os
+import signal
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Sink
 from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
-from egovcp.terminal import echo, one_line
+from egovcp.terminal import echo
+from egovcp.workers import stop_on_signal
 from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.live.display import Display
 from egovcp_deploy.live.operators import open_operator
 from egovcp_deploy.live.planner_loop import (
     START_S,
@@ -46,7 +49,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
     controller_id = make_controller(robot.controller).id
     artifact.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
-    stays = not (config.operator.type == "auto" and config.operator.duration)
+    stays = config.operator.type == "keyboard" or not config.operator.duration
     if "OMP_NUM_THREADS" not in os.environ:
         # The control process and the logs need a core: planning threads that wait for one that was
         # preempted are slower than fewer threads.
@@ -55,37 +58,65 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
     runner = PlannerRunner(policy, config.imagine)
     runner.warm_up()
     info = run_info(config, controller_id, artifact, backend_of(policy))
-    try:
-        with (
-            open_operator(config.operator) as operator,
-            open_viewer(config.log) as viewer,
-            recording(folder, info, config.log, viewer, blocking=False) as sink,
-            tqdm(unit="tick", desc="live") as bar,
-            running_control(robot) as control,
-        ):
-            process, watchdog, clock = control.process, control.watchdog, MonotonicClock()
-            loop = PlannerLoop(runner, control.link, operator, sink, clock, process.is_alive, stays)
-            watchdog.expected = lambda: loop.quitting
-            summary = loop.run(lambda tick: _show(bar, tick))
-            silent = not (summary.ticks or summary.failure or loop.quitting)
-            died = not process.is_alive()
-            stop_control(process, loop)
-            watchdog.join_if_ended()
-            if silent and died:
-                control.check_alive()
-            if silent:
-                raise EnvironmentFailure(
-                    f"no observation arrived within {START_S:g} s; egovcp-deploy --dry_run=true "
-                    "checks robot and camera"
+    with ExitStack() as signals:
+        try:
+            with (
+                open_operator(config.operator) as operator,
+                open_viewer(config.log) as viewer,
+                recording(folder, info, config.log, viewer, blocking=False) as sink,
+                closing(Display()) as display,
+                running_control(robot) as control,
+            ):
+                # Another Ctrl-C must not end the program before the logs are complete.
+                signals.enter_context(stop_on_signal(signals=(signal.SIGINT,), interrupt=False))
+                process, watchdog = control.process, control.watchdog
+                loop = PlannerLoop(
+                    runner,
+                    control.link,
+                    operator,
+                    sink,
+                    MonotonicClock(),
+                    process.is_alive,
+                    stays,
+                    process.kill,
+                    display.warn,
                 )
-            if watchdog.acted and summary.ticks:
-                summary.damped = f"the control process died (exit code {process.exitcode})"
-    except EgovcpError:
-        for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
-            path.unlink()
-        raise
-    report: dict[str, Any] = {
-        "robot": robot.type,
+                watchdog.expected = lambda: loop.quitting
+                summary = loop.run(display.show)
+                silent = not (summary.ticks or summary.failure or loop.quitting)
+                died = not process.is_alive()
+                stop_control(process, watchdog)
+                if loop.interrupts and not (summary.ticks or summary.failure):
+                    raise KeyboardInterrupt
+                if silent and died:
+                    control.check_alive()
+                if silent:
+                    raise EnvironmentFailure(
+                        f"no observation arrived within {START_S:g} s; egovcp-deploy "
+                        "--dry_run=true checks robot and camera"
+                    )
+                if watchdog.acted and summary.ticks:
+                    summary.damped = f"the control process died (exit code {process.exitcode})"
+        except (EgovcpError, KeyboardInterrupt):  # the latter only before the first observation
+            for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
+                path.unlink()
+            raise
+        report = _report(summary, sink, info, robot.type)
+        write_json(folder / "deploy.json", report)
+    skipped = f"; {summary.skipped} observations skipped" if summary.skipped else ""
+    echo(
+        f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
+        f"plan {report['latency_ms_p50']:.0f} ms, p99 {report['latency_ms_p99']:.0f}, "
+        f"{summary.late} late; plans computed by {info.backend}{skipped}"
+    )
+    print_viewer_command(folder / "rollout-0.rrd")
+    _raise_failure(summary, folder)
+
+
+def _report(summary: LiveSummary, sink: Sink, info: RunInfo, robot: str) -> dict[str, Any]:
+    """The content of ``deploy.json``; ``sink`` is closed."""
+    return {
+        "robot": robot,
         "ticks": summary.ticks,
         "ticks_running": summary.running,
         "ticks_held": summary.held,
@@ -101,15 +132,6 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
         "events": summary.events,
         **provenance(info),
     }
-    write_json(folder / "deploy.json", report)
-    skipped = f"; {summary.skipped} observations skipped" if summary.skipped else ""
-    echo(
-        f"{summary.ticks} steps, {summary.running} running, {summary.held} held; observation to "
-        f"plan {report['latency_ms_p50']:.0f} ms, p99 {report['latency_ms_p99']:.0f}, "
-        f"{summary.late} late; plans computed by {info.backend}{skipped}"
-    )
-    print_viewer_command(folder / "rollout-0.rrd")
-    _raise_failure(summary, folder)
 
 
 def _raise_failure(summary: LiveSummary, folder: Path) -> None:
@@ -122,15 +144,8 @@ def _raise_failure(summary: LiveSummary, folder: Path) -> None:
     if isinstance(summary.failure, EgovcpError) and not summary.held:
         raise summary.failure
     if summary.failure is not None:
+        held = " and the robot was held" if summary.held else ""
         raise SafetyStop(
-            f"the planner failed and the robot was held: {describe_failure(summary.failure)}. The "
-            f"log is in {folder}; --debug prints the traceback"
+            f"the planner failed{held}: {describe_failure(summary.failure)}. The log is in "
+            f"{folder}; --debug prints the traceback"
         ) from summary.failure
-
-
-def _show(bar: Any, tick: Tick) -> None:
-    for event in tick.events:
-        bar.write(one_line(f"{tick.time_ns / 1e9:8.2f} s  {event}"))
-    plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
-    bar.set_postfix_str(f"{tick.mode}{plan}", refresh=False)
-    bar.update(1)

@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 _START_S: Final = 120.0  # for the operator to bring the robot to RUN
 _OBSERVATION_S: Final = 0.5  # longest wait for an observation; one comes every 40 ms
-_END_S: Final = 5.0
 _PLAN_TICKS: Final = 4  # that an action covers, its own included, if the next one is late
 
 
@@ -54,7 +53,6 @@ class ExternalPolicyRobot:
         damped."""
         try:
             self._control = self._stack.enter_context(running_control(self._options))
-            self._control.watchdog.expected = lambda: self._closing
             deadline = time.monotonic() + _START_S
             while self.mode != State.RUN:
                 self._control.check_alive()
@@ -124,10 +122,12 @@ class ExternalPolicyRobot:
         if self._closing:
             return
         self._closing = True
-        if self.mode == State.RUN and self._control.process.is_alive():
-            self._send(OperatorCommand(OperatorRequest.HOLD))
-            time.sleep(EASE_S)
-        if self.mode:
-            self._send(OperatorCommand(quit=True))
-            self._control.process.join(_END_S)
-        self._stack.close()
+        try:
+            if self.mode == State.RUN and self._control.process.is_alive():
+                self._send(OperatorCommand(OperatorRequest.HOLD))
+                time.sleep(EASE_S)
+            if self.mode:
+                self._send(OperatorCommand(quit=True))
+                self._control.watchdog.expected = lambda: True
+        finally:  # also after an interrupt: it ends the control process, which damps
+            self._stack.close()

@@ -1,7 +1,7 @@
 """Messages between the control process and the planner's process: numbers and text, never code.
 
 A message is one JSON header and the raw bytes of its arrays. Neither end waits for the other:
-messages that cannot be sent at once, or arrive damaged, are dropped.
+messages that cannot be sent at once, because the queue is full, or arrive damaged, are dropped.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import zmq
 
+from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, NUM_JOINTS, STATE_DIM
@@ -27,7 +28,7 @@ _MOTOR_DTYPES: Final = {
     "enabled": "?",
 }
 _PLAN_PARTS: Final = 2
-_MAX_RECEIVED: Final = 4 * BACKLOG  # messages per call
+MAX_RECEIVED: Final = 4 * BACKLOG  # messages per call
 _DAMAGED: Final = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
@@ -81,20 +82,19 @@ def decode_observation(parts: Sequence[bytes]) -> ObservationMessage | None:
 
 
 def encode_plan(plan: PlanMessage) -> list[bytes]:
-    """Encode the actions of a plan, without what only the log needs."""
-    header = {"tick": plan.tick, "plan_ms": plan.plan_ms, "events": plan.events}
+    """Encode the actions of a plan, without what only the log needs: the sender logs it."""
+    header = {"tick": plan.tick, "plan_ms": plan.plan_ms}
     return [json.dumps(header).encode(), np.ascontiguousarray(plan.actions, "<f4").tobytes()]
 
 
 def decode_plan(parts: Sequence[bytes]) -> PlanMessage | None:
-    """Inverse of `encode_plan`; None: damaged, or another message."""
+    """Inverse of `encode_plan`, without events; None: damaged, or another message."""
     try:
         raw, actions = parts
         header = json.loads(raw)
         steps = np.frombuffer(actions, "<f4").reshape(1, -1, ACTION_DIM)
         step = PolicyStep(steps[:, 0], steps)
-        events = tuple(map(str, header["events"]))
-        return PlanMessage(int(header["tick"]), step, float(header["plan_ms"]), events=events)
+        return PlanMessage(int(header["tick"]), step, float(header["plan_ms"]))
     except _DAMAGED:
         return None
 
@@ -121,30 +121,38 @@ def decode_operator_command(parts: Sequence[bytes]) -> OperatorCommand | None:
 
 class Link:
     """One end of a pair of sockets at ``address``, such as ``ipc:///run/user/1000/egovcp``, which
-    the end with ``serve`` creates."""
+    the end with ``serve`` creates; raises `EnvironmentFailure` if that is not possible."""
 
     def __init__(self, address: str, serve: bool) -> None:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PAIR)
         self._socket.set_hwm(2 * BACKLOG)
         self._socket.setsockopt(zmq.LINGER, 0)
-        if serve:
-            self._socket.bind(address)
-        else:
-            self._socket.connect(address)
+        try:
+            if serve:
+                self._socket.bind(address)
+            else:
+                self._socket.connect(address)
+        except zmq.ZMQError as error:
+            self._socket.close()
+            raise EnvironmentFailure(
+                f"cannot use the socket {address} ({error.strerror}), a path of at most 107 "
+                "characters; set TMPDIR to a shorter folder that you can write to"
+            ) from error
 
-    def send(self, parts: Sequence[bytes]) -> None:
-        """Send a message, or drop it if the other end does not receive."""
+    def send(self, parts: Sequence[bytes]) -> bool:
+        """Send a message, or drop it if the other end does not receive; whether it was sent."""
         try:
             self._socket.send_multipart(parts, zmq.NOBLOCK)
         except zmq.Again:
-            return
+            return False
+        return True
 
     def receive(self, timeout_s: float = 0.0) -> Iterator[list[bytes]]:
-        """All waiting messages, at most `_MAX_RECEIVED`, so that a sender cannot delay the
+        """All waiting messages, at most `MAX_RECEIVED`, so that a sender cannot delay the
         receiver for longer; waits at most ``timeout_s`` for the first."""
         if timeout_s > 0 and not self._socket.poll(round(timeout_s * 1e3)):
             return
-        for _ in range(_MAX_RECEIVED):
+        for _ in range(MAX_RECEIVED):
             try:
                 yield self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -163,9 +171,9 @@ class RemotePlanner:
         self._commands: list[OperatorCommand] = []
         self.alive = True  # set to false by the owner once the planner's process has ended
 
-    def submit(self, observation: ObservationMessage) -> None:
+    def submit(self, observation: ObservationMessage) -> bool:
         """Send o_t; it is dropped if the planner does not receive."""
-        self._link.send(encode_observation(observation))
+        return self._link.send(encode_observation(observation))
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         """Plans that have arrived; operator commands are kept for `take_commands`."""

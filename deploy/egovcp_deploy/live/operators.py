@@ -1,4 +1,4 @@
-"""Operators: a script, the keys of a terminal, or the robot's remote control. They request state
+"""Operators: the robot's remote control, the keys of a terminal, or a script. They request state
 changes and the base velocity."""
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import numpy as np
 from egovcp.errors import UsageError
 from egovcp.rate import NS_PER_S, RateLimiter
 from egovcp.terminal import echo
+from egovcp_deploy.live.control import VELOCITY_HIGH, VELOCITY_LOW
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
-from egovcp_deploy.robots.wire import RemoteControl
+from egovcp_deploy.robots.wire import FULL_STICK, RemoteControl
 
 if TYPE_CHECKING:
     from egovcp_deploy.config import OperatorOptions
@@ -28,46 +29,62 @@ _VELOCITY_PERIOD_S: Final = 0.1
 _REQUEST_PERIOD_S: Final = 0.5  # of a refused request; a shorter one only fills the log
 
 
-class AutomaticOperator:
-    """Stands up, arms, and runs with ``velocity`` (vx, vy in m/s, yaw rate in rad/s); after
-    ``duration_s`` (0: never) it holds and ends the run. For simulation and scripts."""
+class TimedOperator:
+    """Leaves all requests to the robot's remote control. It holds ``duration_s`` (0: never) after
+    RUN began or the planner failed, and ends the run `EASE_S` later."""
+
+    def __init__(self, duration_s: float = 0.0) -> None:
+        self._duration_ns = round(duration_s * NS_PER_S)
+        self._next_ns = 0
+        self._begin_ns: int | None = None
+        self._hold_ns: int | None = None
+
+    def commands(self, now_ns: int, mode: str, failed: bool = False) -> list[OperatorCommand]:
+        """The next step, repeated until it is done; ``mode`` is the robot's `State`, empty:
+        unknown; ``failed``: whether the planner has failed."""
+        if now_ns < self._next_ns:
+            return []
+        if self._begin_ns is None and (failed or mode == State.RUN):
+            self._begin_ns = now_ns
+        command = self._end(now_ns) or self._drive(mode)
+        period = _REQUEST_PERIOD_S if command.request else _VELOCITY_PERIOD_S
+        self._next_ns = now_ns + round(period * NS_PER_S)
+        return [] if command == OperatorCommand() else [command]
+
+    def _end(self, now_ns: int) -> OperatorCommand | None:
+        """The command that ends the run, when its time is over."""
+        if self._hold_ns is None and self._begin_ns is not None and self._duration_ns:
+            over = now_ns - self._begin_ns > self._duration_ns
+            self._hold_ns = now_ns if over else None
+        if self._hold_ns is None:
+            return None
+        eased = now_ns - self._hold_ns > EASE_S * NS_PER_S
+        return OperatorCommand(OperatorRequest.HOLD, quit=eased)
+
+    def _drive(self, mode: str) -> OperatorCommand:
+        """The command of a run whose time is not over."""
+        return OperatorCommand()
+
+
+class AutomaticOperator(TimedOperator):
+    """Stands up, arms, and runs with ``velocity`` (vx, vy in m/s, yaw rate in rad/s). For
+    simulation and scripts."""
 
     def __init__(
         self, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float = 0.0
     ) -> None:
+        super().__init__(duration_s)
         self._velocity = velocity
-        self._duration_ns = round(duration_s * NS_PER_S)
-        self._next_ns = 0
-        self._run_ns: int | None = None
-        self._hold_ns: int | None = None
 
-    def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
-        """The next step, repeated until it is done; ``mode`` is the robot's `State`, empty:
-        unknown."""
-        if now_ns < self._next_ns:
-            return []
-        command = self._next(now_ns, mode)
-        period = _REQUEST_PERIOD_S if command.request else _VELOCITY_PERIOD_S
-        self._next_ns = now_ns + round(period * NS_PER_S)
-        return [command]
-
-    def _next(self, now_ns: int, mode: str) -> OperatorCommand:
-        if self._hold_ns is not None:
-            eased = now_ns - self._hold_ns > EASE_S * NS_PER_S
-            return OperatorCommand(OperatorRequest.HOLD, quit=eased)
-        if mode == State.RUN and self._run_ns is None:
-            self._run_ns = now_ns
-        if self._run_ns is None:
-            requests = {
-                State.INIT: OperatorRequest.STAND,
-                State.STAND: OperatorRequest.ARM,
-                State.ARMED: OperatorRequest.RUN,
-            }
-            return OperatorCommand(requests.get(State(mode)) if mode else None)
-        if self._duration_ns and now_ns - self._run_ns > self._duration_ns:
-            self._hold_ns = now_ns
-            return OperatorCommand(OperatorRequest.HOLD)
-        return OperatorCommand(velocity=self._velocity)
+    def _drive(self, mode: str) -> OperatorCommand:
+        if self._begin_ns is not None:
+            return OperatorCommand(velocity=self._velocity)
+        requests = {
+            State.INIT: OperatorRequest.STAND,
+            State.STAND: OperatorRequest.ARM,
+            State.ARMED: OperatorRequest.RUN,
+        }
+        return OperatorCommand(requests.get(State(mode)) if mode else None)
 
 
 # --- keyboard --------------------------------------------------------------------------------
@@ -100,7 +117,7 @@ class Keyboard:
         self._velocity = (0.0, 0.0, 0.0)
         self._limiter = RateLimiter(_VELOCITY_PERIOD_S)
 
-    def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
+    def commands(self, now_ns: int, mode: str, failed: bool = False) -> list[OperatorCommand]:
         """One command per key, and the velocity ten times a second."""
         commands = []
         while select.select([sys.stdin], [], [], 0.0)[0]:
@@ -112,8 +129,8 @@ class Keyboard:
             elif key == "x":
                 self._velocity = (0.0, 0.0, 0.0)
             elif key in _VELOCITY_STEPS:
-                sums = np.round(np.add(self._velocity, _VELOCITY_STEPS[key]), 3)
-                vx, vy, yaw_rate = sums.tolist()
+                wanted = np.round(np.add(self._velocity, _VELOCITY_STEPS[key]), 3)
+                vx, vy, yaw_rate = np.clip(wanted, VELOCITY_LOW, VELOCITY_HIGH).tolist()
                 self._velocity = (vx, vy, yaw_rate)
         if self._limiter.ready(now_ns):
             commands.append(OperatorCommand(velocity=self._velocity))
@@ -121,6 +138,12 @@ class Keyboard:
 
 
 # --- the robot's remote control --------------------------------------------------------------
+REMOTE_HELP: Final = (
+    "remote control: Y stands the robot up, A arms it, start runs the planner, B holds, L1 + B "
+    "damps at once; to start it from here instead: --operator.type=keyboard, or for "
+    "egovcp-fake-g1 --operator.type=auto"
+)
+_DEAD_BAND: Final = 0.05 * np.array(FULL_STICK)  # of the sticks, which rest near 0
 _ESTOP: Final = frozenset({"L1", "B"})
 _BUTTONS: Final = {
     "Y": OperatorRequest.STAND,
@@ -131,22 +154,27 @@ _BUTTONS: Final = {
 
 
 class RemoteOperator:
-    """Sticks of the remote control, unless they are at rest, and its buttons: Y stands up, A arms,
-    start runs, B holds, each when it goes down; L1 and B together are the emergency stop, for as
-    long as both are held."""
+    """Sticks of the remote control, with one zero when they come to rest, and its buttons: Y stands
+    up, A arms, start runs, B holds, each when it goes down after the first message; L1 and B
+    together are the emergency stop, for as long as both are held."""
 
     def __init__(self) -> None:
-        self._before: frozenset[str] = frozenset()
+        self._before: frozenset[str] | None = None  # pressed buttons of the last message
+        self._moving = False
 
     def commands(self, raw: bytes) -> list[OperatorCommand]:
         """New commands, given the newest message of the remote control (`LowState.remote`)."""
         remote = RemoteControl.parse(raw)
         if remote is None:
             return []
-        new, self._before = remote.pressed - self._before, remote.pressed
-        vx, vy, yaw_rate = remote.velocity.tolist()
-        moving = any((vx, vy, yaw_rate))
-        commands = [OperatorCommand(velocity=(vx, vy, yaw_rate))] if moving else []
+        new = frozenset() if self._before is None else remote.pressed - self._before
+        self._before = remote.pressed
+        velocity = np.where(np.abs(remote.velocity) < _DEAD_BAND, 0.0, remote.velocity)
+        vx, vy, yaw_rate = velocity.tolist()
+        before, self._moving = self._moving, any((vx, vy, yaw_rate))
+        commands = list[OperatorCommand]()
+        if self._moving or before:
+            commands.append(OperatorCommand(velocity=(vx, vy, yaw_rate)))
         if remote.pressed >= _ESTOP:
             return [*commands, OperatorCommand(OperatorRequest.ESTOP)]
         return commands + [
@@ -154,7 +182,7 @@ class RemoteOperator:
         ]
 
 
-type Operator = AutomaticOperator | Keyboard
+type Operator = TimedOperator | Keyboard
 
 
 @contextmanager
@@ -164,10 +192,14 @@ def open_operator(options: OperatorOptions) -> Iterator[Operator]:
     if options.type == "auto":
         yield AutomaticOperator(options.velocity, options.duration)
         return
+    if options.type == "remote":
+        echo(REMOTE_HELP)
+        yield TimedOperator(options.duration)
+        return
     if not sys.stdin.isatty():
         raise UsageError(
             "--operator.type=keyboard needs a terminal, but the input is none; "
-            "run it in one, or choose --operator.type=auto"
+            "run it in one, or use the robot's remote control (--operator.type=remote)"
         )
     before = termios.tcgetattr(sys.stdin)
     echo(_KEYBOARD_HELP)

@@ -18,7 +18,13 @@ from egovcp.log.tick import Sink, Tick
 from egovcp.rate import Clock
 from egovcp.spec import PLANNER_DT
 from egovcp.workers import stop_on_signal
-from egovcp_deploy.live.link import Link, decode_observation, encode_operator_command, encode_plan
+from egovcp_deploy.live.link import (
+    MAX_RECEIVED,
+    Link,
+    decode_observation,
+    encode_operator_command,
+    encode_plan,
+)
 from egovcp_deploy.live.operators import EASE_S, Operator
 from egovcp_deploy.pilot.planner import (
     BUDGET_S,
@@ -32,6 +38,7 @@ from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 
 _WAIT_S: Final = 0.01
 _AFTER_DAMP_S: Final = 1.0  # still recorded once the motors are damped
+_ESTOP_S: Final = 0.5  # for the control process to report DAMP; else it hangs
 START_S: Final = 60.0  # for the control process to send its first observation
 _DECODING_DECAY: Final = 0.98  # of the expected decoding time, per image that is not decoded
 _NS: Final = 1e9
@@ -65,6 +72,9 @@ class PlannerLoop:
         control_alive: whether the control process runs.
         stays: after the first Ctrl-C the robot stands until the second one. Else the run ends
             after `EASE_S`, and the motors are damped.
+        kill: kills a control process that does not damp the motors after the second Ctrl-C; its
+            watchdog must damp them.
+        warn: prints a line; must not block.
     """
 
     def __init__(
@@ -76,10 +86,12 @@ class PlannerLoop:
         clock: Clock,
         control_alive: Callable[[], bool],
         stays: bool = False,
+        kill: Callable[[], None] = lambda: None,
+        warn: Callable[[str], None] = warn_on_stderr,
     ) -> None:
         self._runner, self._link, self._operator = runner, link, operator
         self._sink, self._clock, self._control_alive = sink, clock, control_alive
-        self._stays = stays
+        self._stays, self._kill, self._warn = stays, kill, warn
         self.summary = LiveSummary()
         self.interrupts: list[int] = []  # SIGINT as often as received
         self.quitting = False  # whether the control process is expected to end
@@ -90,6 +102,7 @@ class PlannerLoop:
         self._decoding_ns = 0
         self._pending: tuple[ObservationMessage, PlanMessage | None] | None = None
         self._held_ns: int | None = None
+        self._estop_ns: int | None = None
         self._damped_ns: int | None = None
 
     def run(self, on_tick: Callable[[Tick], None] = lambda tick: None) -> LiveSummary:
@@ -112,6 +125,7 @@ class PlannerLoop:
         """Pass on the operator's commands, plan from new observations, and log them."""
         self._handle_commands(self._clock.now_ns())
         observations = self._receive()
+        self._check_estop(self._clock.now_ns())
         plan: PlanMessage | None = None
         try:
             if observations and self.summary.failure is None:
@@ -121,8 +135,12 @@ class PlannerLoop:
                 self._log(observation, plan if observation is observations[-1] else None)
 
     def _receive(self) -> list[ObservationMessage]:
-        received = (decode_observation(parts) for parts in self._link.receive(_WAIT_S))
-        observations = [observation for observation in received if observation is not None]
+        received = batch = list(self._link.receive(_WAIT_S))
+        while len(batch) >= MAX_RECEIVED:  # until no message waits
+            batch = list(self._link.receive())
+            received = [*received, *batch]
+        decoded = (decode_observation(parts) for parts in received)
+        observations = [observation for observation in decoded if observation is not None]
         summary = self.summary
         for observation in observations:
             self._mode = observation.mode
@@ -162,6 +180,7 @@ class PlannerLoop:
         summary.plan_ms.append(plan.plan_ms)
         summary.latency_ms.append(latency * 1e3)
         summary.iterations.append(plan.step.iterations)
+        summary.events += plan.events
         self._events += self._runner.adapt(plan, late)
 
     # --- the log -------------------------------------------------------------------------
@@ -215,17 +234,19 @@ class PlannerLoop:
             self._send(OperatorCommand(OperatorRequest.HOLD))
             message = f"the planner failed: {describe_failure(error)}"
             self._events.append(message)
-            with suppress(Exception):  # the terminal may be what failed
-                warn_on_stderr(
-                    f"{message}; the robot is held until the operator ends the run: Ctrl-C twice "
-                    "damps it"
+            if self._mode not in ("", State.INIT):
+                message += (
+                    "; the robot is held until the operator ends the run: Ctrl-C twice damps it"
                 )
+            with suppress(Exception):  # the terminal may be what failed
+                self._warn(message)
 
     # --- operator commands ---------------------------------------------------------------
     def _handle_commands(self, now_ns: int) -> None:
         commands: Sequence[OperatorCommand] = ()
         try:
-            commands = self._operator.commands(now_ns, self._mode)
+            failed = self.summary.failure is not None
+            commands = self._operator.commands(now_ns, self._mode, failed)
         except Exception:
             if self.summary.failure is None:
                 raise  # else the operator's failure is not the first one, which is reported
@@ -240,10 +261,14 @@ class PlannerLoop:
             self._send(OperatorCommand(quit=True), "the planner failed before the robot stood")
 
     def _interrupt_commands(self, interrupts: int, now_ns: int) -> list[OperatorCommand]:
-        """First Ctrl-C: hold, ease the hands, and end the run unless ``stays``. Second: damp."""
+        """First Ctrl-C: hold, ease the hands, and end the run unless ``stays``; before the first
+        observation, which may never arrive, end it at once. Second: damp."""
         if not interrupts:
             return []
+        if not self._mode:
+            return [OperatorCommand(quit=True)]
         if interrupts >= 2:
+            self._estop_ns = now_ns if self._estop_ns is None else self._estop_ns
             estop = OperatorCommand(OperatorRequest.ESTOP)
             return [estop] if self._damped_ns is None else []
         if self._held_ns is None:
@@ -252,6 +277,13 @@ class PlannerLoop:
         if now_ns - self._held_ns <= EASE_S * _NS:
             return []
         return [OperatorCommand(OperatorRequest.HOLD, quit=not self._stays)]
+
+    def _check_estop(self, now_ns: int) -> None:
+        """Kill the control process if it has not followed the emergency stop of Ctrl-C."""
+        if self._estop_ns is None or self._damped_ns is not None:
+            return
+        if now_ns - self._estop_ns > _ESTOP_S * _NS:
+            self._kill()
 
     def _send(self, command: OperatorCommand, end_reason: str = "") -> None:
         """Pass on a command; ``end_reason`` is why the run ends if it is the last."""

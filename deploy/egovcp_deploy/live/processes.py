@@ -8,9 +8,10 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from ctypes import c_bool
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.async_sink import warn_on_stderr
@@ -19,9 +20,6 @@ from egovcp_deploy.live.control_process import control_process, damp_motors
 from egovcp_deploy.live.hardware import RobotOptions
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
-
-if TYPE_CHECKING:
-    from egovcp_deploy.live.planner_loop import PlannerLoop
 
 _END_S: Final = 5.0  # for a process to end by itself
 _WATCHDOG_ROUNDS: Final = 20  # of damping commands, 50 ms each
@@ -45,52 +43,45 @@ class RunningControl(NamedTuple):
 
 @contextmanager
 def running_control(options: RobotOptions) -> Iterator[RunningControl]:
-    """Start the control process, its link and its watchdog; raises `EnvironmentFailure` if the
-    robot does not answer."""
+    """Start the control process, its link and its watchdog, and end it with `stop_control`; raises
+    `EnvironmentFailure` if the robot does not answer."""
     with tempfile.TemporaryDirectory(prefix="egovcp-run-") as folder:
         address = f"ipc://{folder}/link"
         with (
             closing(Link(address, serve=True)) as link,
             standby_body(options.bridge) as body,
-            _started(options, address) as process,
         ):
-            watchdog = DampingWatchdog(process, body)
+            context = multiprocessing.get_context("spawn")
+            commanded = context.RawValue(c_bool, False)  # no lock: neither process waits for it
+            process = context.Process(
+                target=control_process,
+                args=(options, address, os.getpid(), commanded),
+                name="egovcp-control",
+                daemon=True,  # the exit of this process sends it SIGTERM, on which it damps
+            )
+            with inherited_by_workers():
+                process.start()
+            watchdog = DampingWatchdog(process, body, lambda: commanded.value)
             try:
                 yield RunningControl(process, link, watchdog)
             finally:
-                watchdog.join_if_ended()
+                stop_control(process, watchdog)
 
 
-@contextmanager
-def _started(options: RobotOptions, address: str) -> Iterator[BaseProcess]:
-    """The process; terminated, then killed, when the context is left."""
-    process = multiprocessing.get_context("spawn").Process(
-        target=control_process, args=(options, address, os.getpid()), name="egovcp-control"
-    )
-    with inherited_by_workers():
-        process.start()
-    try:
-        yield process
-    finally:
-        for end in (process.terminate, process.kill):
-            if process.is_alive():
-                end()
-                process.join(_END_S)
-
-
-def stop_control(process: BaseProcess, planner: PlannerLoop) -> None:
+def stop_control(process: BaseProcess, watchdog: DampingWatchdog) -> None:
     """End the control process: wait for it if it has a quit command, then SIGTERM, on which it
-    damps the motors too, then SIGKILL, after which the watchdog must damp them."""
-    if planner.quitting:
+    damps the motors too, then SIGKILL, after which ``watchdog`` damps them."""
+    if watchdog.expected():
         process.join(_END_S)
     if process.is_alive():
-        planner.quitting = True
+        watchdog.expected = lambda: True
         process.terminate()
         process.join(_END_S)
     if process.is_alive():
-        planner.quitting = False
+        watchdog.expected = lambda: False
         process.kill()
-        process.join()
+        process.join(_END_S)
+    watchdog.join_if_ended()
 
 
 @contextmanager
@@ -107,18 +98,24 @@ def standby_body(config: BridgeConfig) -> Iterator[BridgeRobot]:
 
 class DampingWatchdog:
     """A thread that damps the robot over ``body``, a connection that nothing else uses, if the
-    control process ends although ``expected()`` is false."""
+    control process ends although ``expected()`` is false. If it has never sent a motor command
+    (``commanded()`` is false), the robot is not ours to damp."""
 
-    def __init__(self, process: BaseProcess, body: BridgeRobot) -> None:
-        self._process, self._body = process, body
-        self.expected: Callable[[], bool] = lambda: False
+    def __init__(
+        self,
+        process: BaseProcess,
+        body: BridgeRobot,
+        commanded: Callable[[], bool] = lambda: True,
+    ) -> None:
+        self._process, self._body, self._commanded = process, body, commanded
+        self.expected: Callable[[], bool] = lambda: False  # whether a quit command was sent
         self.acted = False  # whether the robot had to be damped from here
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
 
     def _watch(self) -> None:
         wait([self._process.sentinel])
-        if not self.expected():
+        if self._commanded() and not self.expected():
             self.acted = True
             for _ in range(_WATCHDOG_ROUNDS):
                 damp_motors(self._body)

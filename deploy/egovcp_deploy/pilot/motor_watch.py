@@ -91,6 +91,7 @@ class MotorWatch:
         self._warned: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
         self._faults: NDArray[np.integer] = np.zeros(NUM_JOINTS, np.int64)
         self._overheated = False
+        self._hot_sensors: NDArray[np.bool_] = np.zeros((NUM_JOINTS, 2), np.bool_)  # that set it
         self._reminder = RateLimiter(_REMINDER_S)
         self._last = MotorVerdict()
         self._events: list[str] = []
@@ -177,7 +178,9 @@ class MotorWatch:
 
     def _overload(self, motors: MotorReadings) -> str:
         if motors.faults is None:
-            return ""
+            overloaded = np.flatnonzero(self._faults & OVERLOAD_BITS)
+            lost = "; motors no longer report their status"
+            return f"{_fault(self._faults, int(overloaded[0]))}{lost}" if len(overloaded) else ""
         for joint in np.flatnonzero(motors.faults & ~self._faults):
             self._events.append(_fault(motors.faults, int(joint), "reports:"))
         self._faults = motors.faults
@@ -185,14 +188,19 @@ class MotorWatch:
         return _fault(motors.faults, int(overloaded[0])) if len(overloaded) else ""
 
     def _overheating(self, motors: MotorReadings, elapsed: float) -> str:
-        """A motor that was too hot for `HEAT_PERSISTS_S`, until all are cool enough to arm."""
+        """A motor that was too hot for `HEAT_PERSISTS_S`, until all are cool enough to arm. The
+        sensors that were too hot must report so: a missing value does not count as cool."""
         if motors.temperature is None:
             lost = "motors were too hot and no longer report temperatures"
             return lost if self._overheated else ""
         warn, refuse, hold = margins(motors.temperature)
+        sensors = sensor_margins(motors.temperature)
         if self._hot.update(hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
             self._overheated = True
-        self._overheated &= bool((refuse >= 0.0).any())
+            self._hot_sensors |= self._hot.lasted(HEAT_PERSISTS_S)[:, None] & (sensors[2] >= 0.0)
+        cool = np.isfinite(motors.temperature) & (sensors[1] < 0.0)
+        self._hot_sensors &= ~cool
+        self._overheated &= bool(self._hot_sensors.any() or (refuse >= 0.0).any())
         warm = warn >= 0.0
         for joint in np.flatnonzero(warm & ~self._warned):
             words = _degrees(motors.temperature[joint])
@@ -200,6 +208,12 @@ class MotorWatch:
         self._warned = warm | (self._warned & (warn > -_HYSTERESIS_K))
         if not self._overheated:
             return ""
+        lost = self._hot_sensors & ~np.isfinite(motors.temperature)
+        if lost.any():
+            joint = int(np.argmax(lost.any(axis=1)))
+            return (
+                f"the motor of {JOINT_NAMES[joint]} was too hot and no longer reports a temperature"
+            )
         joint = int(np.argmax(hold))
         words = _degrees(motors.temperature[joint])
         return f"the motor of {JOINT_NAMES[joint]} is too hot: {words}"
@@ -231,20 +245,28 @@ class _Debounce:
         longer = np.where(self._seconds >= 0.0, self._seconds + elapsed, 0.0)
         self._seconds = np.where(condition, longer, _INACTIVE)
         joint = int(np.argmax(self._seconds))
-        return joint if self._seconds[joint] >= limit - 1e-9 else None
+        return joint if self.lasted(limit)[joint] else None
+
+    def lasted(self, limit: float) -> NDArray[np.bool_]:
+        """(29,) whether the condition has held for ``limit`` s or more."""
+        return np.asarray(self._seconds >= limit - 1e-9)
 
 
 def _fault(faults: NDArray[np.integer], joint: int, verb: str = "reports") -> str:
     return f"the motor of {JOINT_NAMES[joint]} {verb} {fault_text(int(faults[joint]))}"
 
 
-def margins(temperature: Array) -> tuple[Array, Array, Array]:
-    """Temperatures (29, 1) or (29, 2) -> (29,) K above the limits to warn, refuse and hold, of the
-    sensor closest to its own limit; negative: below. Missing values count as cold."""
+def sensor_margins(temperature: Array) -> Array:
+    """Temperatures (29, k), k = 1 or 2 -> (3, 29, k) K above the limits to warn, refuse and hold;
+    negative: below. Missing values count as cold."""
     limits = np.array([SINGLE] if temperature.shape[1] == 1 else [CASING, WINDING])  # (k, 3)
     known = np.where(np.isfinite(temperature), temperature, -np.inf)
-    beyond = (known[:, :, None] - limits).max(axis=1)  # (29, 3)
-    warn, refuse, hold = beyond.T
+    return np.asarray(known - limits.T[:, None, :])
+
+
+def margins(temperature: Array) -> tuple[Array, Array, Array]:
+    """As `sensor_margins`, (29,) each, of the sensor of each motor closest to its own limit."""
+    warn, refuse, hold = sensor_margins(temperature).max(axis=2)
     return warn, refuse, hold
 
 

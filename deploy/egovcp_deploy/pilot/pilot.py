@@ -241,7 +241,7 @@ class Pilot:
         link: Mapping[str, float] | None = None,
     ) -> None:
         """Send o_t, depth (48, 64) mm and state (74,), to the planner, with ``events``, ``motors``
-        and ``link`` for its log."""
+        and ``link`` for its log. If it cannot be sent, ``events`` are kept for `take_events`."""
         if self._first:
             self._restart_tick = self.tick
         observation = ObservationMessage(
@@ -258,7 +258,8 @@ class Pilot:
         )
         self._first = False
         self._unanswered.append((self.tick, now_ns))
-        self._planner.submit(observation)
+        if not self._planner.submit(observation):
+            self._events[:0] = events
 
     def receive_plans(self, now_ns: int) -> PlanMessage | None:
         """Take the plans that have arrived by ``now_ns``; returns that of this tick, if any, even

@@ -32,13 +32,13 @@ from egovcp.robot_spec import G1, RobotSpec
 from egovcp.spec import ACTION_BOX, ACTION_HANDS
 
 SKIPPED: Final = "observation skipped: its state is not finite, or impossible"
-BACKLOG: Final = 8  # observations that wait for a busy planner; older ones are dropped
+BACKLOG: Final = 8  # observations that can wait for a busy planner, at least; newer ones are lost
 LOGGED_CANDIDATES: Final = 32  # best first; more would clutter the log
 BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick transports it
 POOR_TO_HALVE: Final = 3  # late or incomplete plans; two good plans compensate for one
 GOOD_TO_DOUBLE: Final = 50  # consecutive good plans, 2 s
 _COMPENSATION: Final = 0.5
-_MIN_SAMPLES: Final = 64
+_MIN_SAMPLES: Final = 16
 _MIN_ELITES: Final = 4  # the mean of two follows Q's errors too closely (docs/planner.md)
 _HANDS: Final[tuple[Hand, ...]] = ("left", "right")
 _BACKENDS: Final = {
@@ -133,8 +133,8 @@ class PlanMessage:
 class PlannerClient(Protocol):
     """Takes observations and returns plans. No call blocks."""
 
-    def submit(self, observation: ObservationMessage) -> None:
-        """Send o_t to the planner."""
+    def submit(self, observation: ObservationMessage) -> bool:
+        """Send o_t to the planner; whether it was sent."""
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         """Plans that have arrived by ``now_ns``, oldest first."""
@@ -248,7 +248,8 @@ class PlannerRunner:
         )
 
     def _advance(self, observation: ObservationMessage) -> list[str]:
-        """Advance the recurrence to ``observation``, or restart it."""
+        """Advance the recurrence to ``observation``, or restart it. The next run of a robot begins
+        at tick 0 again, which loses nothing."""
         expected = observation.tick if self._next_tick is None else self._next_tick
         lost = observation.tick - expected
         self._next_tick = observation.tick + 1
@@ -256,7 +257,7 @@ class PlannerRunner:
             self._policy.reset()
         if not observation.first:
             self._policy.advance(observation.sent[None])
-        return [f"planner lost {lost} observations: recurrence restarted"] if lost else []
+        return [f"planner lost {lost} observations: recurrence restarted"] if lost > 0 else []
 
     def _skipped(self) -> list[str]:
         policy = self._policy
@@ -272,9 +273,10 @@ class InlinePlanner:
         self._runner = runner
         self._plans: list[PlanMessage] = []
 
-    def submit(self, observation: ObservationMessage) -> None:
+    def submit(self, observation: ObservationMessage) -> bool:
         """Plan from o_t."""
         self._plans.append(self._runner.decode(self._runner.plan([observation])))
+        return True
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         """The plans since the last call."""

@@ -44,7 +44,7 @@ _PROBE_S: Final = 1.0
 class ArrivalStats:
     """Statistics of the messages that arrived within a window."""
 
-    rate_hz: float = 0.0  # usable messages per second
+    rate_hz: float = 0.0  # messages used per second: of those that wait together, the newest
     jitter_ms: float = 0.0  # 99th percentile of |interval - median interval|
     gap_ms: float = 0.0  # longest time without a usable message, also since the last one
     lost: float = 0.0  # share of the sent messages that did not arrive or were not usable
@@ -169,6 +169,7 @@ class Subscriber:
         except EnvironmentFailure:
             self._context.destroy(linger=0)
             raise
+        self.older = 0  # messages that arrived with the one being handled, and before it
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._receive, args=(end,), daemon=True)
         self._thread.start()
@@ -197,7 +198,8 @@ class Subscriber:
         now = time.monotonic_ns()
         if len(messages) >= _QUEUE:
             return False
-        for message in reversed(messages):
+        for older, message in reversed(list(enumerate(messages))):
+            self.older = older
             if self._handle(message, now):
                 return True
             if time.monotonic_ns() > now + _MAX_WORK_NS:

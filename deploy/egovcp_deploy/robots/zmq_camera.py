@@ -104,7 +104,8 @@ class ZmqDepthCamera:
         self._malformed = 0  # messages
         self._problem = ""  # of the last one
         self.arrivals = ArrivalMonitor(numbered=True)
-        """Arrivals of usable images; missing and unusable ones count as lost."""
+        """Arrivals of usable images; missing and unusable ones count as lost, but not those that
+        arrived together with a newer one."""
         self._newest: DepthImage | None = None
         self._sequence: int | None = None
         self._subscriber: Subscriber | None = None
@@ -140,7 +141,8 @@ class ZmqDepthCamera:
         if frame.sequence == self._sequence:
             return False
         if self._sequence is not None:
-            missing = (frame.sequence - self._sequence) % SEQUENCES - 1
+            older = self._subscriber.older if self._subscriber else 0  # arrived, but not used
+            missing = (frame.sequence - self._sequence) % SEQUENCES - 1 - older
             if 0 < missing < _MAX_MISSING:
                 self.arrivals.record_loss(time_ns, missing)
         self._sequence = frame.sequence

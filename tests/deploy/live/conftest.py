@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,7 +21,9 @@ from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.planner import ObservationMessage, PlannerRunner
 from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import DepthImage, LowState, MotorCommand
+from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from tests.support.lockstep import DelayedPlanner, LockstepClock
+from tests.support.robots.fake_g1 import FakeG1Thread
 
 TICK_NS = 20_000_000
 QUICK = [
@@ -49,6 +51,17 @@ QUIET = EnvConfig(
 def robot() -> LiveRobot:
     """On the gantry, before an empty scene."""
     return LiveRobot(QUIET)
+
+
+@pytest.fixture
+def fake(robot: LiveRobot) -> Iterator[FakeBridge]:
+    """A fake G1 that a thread steps in real time."""
+    robot.start(Scenario("ball", 0, 0))
+    found = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
+    running = FakeG1Thread(found)
+    yield found
+    running.stop()
+    found.close()
 
 
 @dataclass
@@ -169,9 +182,9 @@ class EventPlanner(DelayedPlanner):
 
     events: list[str]
 
-    def submit(self, observation: ObservationMessage) -> None:
+    def submit(self, observation: ObservationMessage) -> bool:
         self.events += observation.events
-        super().submit(observation)
+        return super().submit(observation)
 
 
 @dataclass

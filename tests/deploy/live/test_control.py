@@ -268,7 +268,24 @@ def test_another_publisher_prevents_arming(make_rig: Make) -> None:
     rig.run(0.1)
     rig.run(0.5, OperatorRequest.STAND)
     assert rig.loop.state is State.INIT
+    assert rig.body.commands == [], "it may balance the robot"
+
+
+def test_the_emergency_stop_damps_a_robot_that_another_program_commands(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.faults.refusal = "another publisher is alive"
+    rig.run(0.1)
+    rig.run(0.1, OperatorRequest.ESTOP)
+    assert len(rig.body.commands) == 5
     assert all(limp(command) for command in rig.body.commands)
+
+
+def test_commands_continue_when_another_program_begins_to_command(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.run(0.1)
+    rig.faults.refusal = "another publisher is alive"
+    rig.run(0.1)
+    assert len(rig.body.commands) == 10
 
 
 def test_the_operators_velocity_is_sent_only_while_running(make_rig: Make) -> None:

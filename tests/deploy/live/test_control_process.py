@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import closing, suppress
+from ctypes import c_bool
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -90,7 +91,7 @@ def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
     ours, theirs = Link(address, serve=True), Link(address, serve=False)
     stopping: list[int] = []
     with closing(open_hardware(bridge, camera)) as hardware, closing(ours), closing(theirs):
-        control = ControlProcess(options, os.getppid(), hardware, theirs)
+        control = ControlProcess(options, os.getppid(), hardware, theirs, c_bool())
         thread = threading.Thread(target=control.run, args=(stopping,))
         thread.start()
         sink = McapSink(file)
@@ -154,8 +155,8 @@ def test_a_blocked_terminal_does_not_stop_the_loop(
 
     pilot = SimpleNamespace(add_events=lambda events: None)
     with open(writer, "w") as full, closing(Link(f"ipc://{tmp_path}/link", serve=True)) as link:
-        control = ControlProcess(options, parent, hardware, link)
-        control._loop = SimpleNamespace(state=State.RUN, tick=tick, pilot=pilot)
+        control = ControlProcess(options, parent, hardware, link, c_bool())
+        control._loop = SimpleNamespace(state=State.RUN, tick=tick, pilot=pilot, commanding=True)
         monkeypatch.setattr(sys, "stderr", full)
         thread = threading.Thread(target=control.run, args=(stopping,))
         thread.start()
@@ -167,9 +168,10 @@ def test_a_blocked_terminal_does_not_stop_the_loop(
             thread.join()
 
 
-#: `control_process` without a robot; its loop sends a signal to itself.
+#: `control_process` without a robot; its loop sends a signal to itself. If the second argument is
+#: 1, it has commanded the motors.
 _STUBBED = """
-import os, sys, time
+import ctypes, os, sys, time
 from types import SimpleNamespace as Stub
 from egovcp_deploy.live import control_process as c
 hardware = Stub(body=None, close=lambda: None)
@@ -182,21 +184,45 @@ c.Link = lambda address, serve: Stub(close=lambda: None)
 c.raise_priority = lambda level: False
 c.ControlProcess = lambda *arguments: Stub(run=run, add_event=lambda event: print(event))
 c.damp_motors = lambda body: print("damped")
-c.control_process(Stub(bridge=None, camera=None), "", 0)
+c.control_process(Stub(bridge=None, camera=None), "", 0, ctypes.c_bool(int(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
-def test_a_signal_damps_the_motors(number: signal.Signals) -> None:
+@pytest.mark.parametrize(
+    ("number", "commanded"),
+    [(signal.SIGTERM, 1), (signal.SIGHUP, 1), (signal.SIGQUIT, 1), (signal.SIGTERM, 0)],
+)
+def test_a_signal_damps_the_motors_if_they_were_commanded(
+    number: signal.Signals, commanded: int
+) -> None:
     result = subprocess.run(
-        [sys.executable, "-c", _STUBBED, str(int(number))],
+        [sys.executable, "-c", _STUBBED, str(int(number)), str(commanded)],
         stdout=subprocess.PIPE,
         text=True,
         check=True,
     )
-    warning, end = result.stdout.splitlines()
+    warning, *end = result.stdout.splitlines()
     assert "no real-time priority" in warning
-    assert end == "damped"
+    assert end == ["damped"] * commanded
+
+
+def test_it_tells_the_watchdog_that_it_has_commanded(tmp_path: Path) -> None:
+    hardware = SimpleNamespace(body=SimpleNamespace(read=lambda: None), camera=None, link=None)
+    stopping, seen, commanded = list[int](), list[bool](), c_bool()
+
+    def tick(now_ns: int, command: OperatorCommand) -> None:
+        seen.append(commanded.value)
+        loop.commanding = len(seen) > 1
+        if len(seen) == 3:
+            stopping.append(signal.SIGTERM)
+
+    loop = SimpleNamespace(state=State.INIT, tick=tick, commanding=False)
+    with closing(Link(f"ipc://{tmp_path}/link", serve=True)) as link:
+        options = RobotOptions(controller="stance")
+        control = ControlProcess(options, os.getppid(), hardware, link, commanded)
+        control._loop = loop
+        control.run(stopping)
+    assert seen == [False, False, True]
 
 
 class Crouching(Reaching):

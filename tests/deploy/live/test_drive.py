@@ -20,11 +20,9 @@ import pytest
 
 from egovcp.errors import DataError
 from egovcp.log.mcap_reader import read_recording
-from egovcp.sim.live import LiveRobot
-from egovcp.sim.scenario import Scenario
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from tests.support.robots.fake_g1 import FakeG1Thread, eventually, fake_g1_process
+from tests.support.robots.fake_g1 import eventually, fake_g1_process
 
 from .conftest import PATIENT, QUICK
 
@@ -89,17 +87,6 @@ class LiveRun:
         return self.program.communicate(timeout=240)[1]
 
 
-@pytest.fixture
-def fake(robot: LiveRobot) -> Iterator[FakeBridge]:
-    """A fake G1 that a thread steps in real time."""
-    robot.start(Scenario("ball", 0, 0))
-    found = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
-    running = FakeG1Thread(found)
-    yield found
-    running.stop()
-    found.close()
-
-
 type Start = Callable[..., subprocess.Popen[str]]
 
 
@@ -108,6 +95,7 @@ def _command(artifact: Path, output: Path, *flags: str, before: str = "") -> lis
     return [
         *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
         *(f"--policy.path={artifact}", f"--output_dir={output}", "--robot.controller=stance"),
+        "--operator.type=auto",
         *flags,
     ]
 

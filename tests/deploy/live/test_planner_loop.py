@@ -12,7 +12,7 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM, STATE_DIM
-from egovcp_deploy.live.link import decode_operator_command, encode_observation
+from egovcp_deploy.live.link import MAX_RECEIVED, decode_operator_command, encode_observation
 from egovcp_deploy.live.planner_loop import PlannerLoop
 from egovcp_deploy.pilot.planner import ObservationMessage, PlannerRunner
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
@@ -43,7 +43,10 @@ class Still:
 
 
 class ControlStub:
-    """The control process at the other end of the link: a report every tick, RUN until HOLD."""
+    """The control process at the other end of the link: a report every tick, RUN until HOLD. It
+    receives nothing if it is ``deaf``."""
+
+    deaf = False
 
     def __init__(self, clock: LockstepClock, mode: State, ticks: int) -> None:
         self._clock, self.mode, self._ticks = clock, mode, ticks
@@ -55,7 +58,7 @@ class ControlStub:
 
     def send(self, parts: Sequence[bytes]) -> bool:
         command = decode_operator_command(parts) if len(parts) == 1 else None
-        if command is not None:
+        if command is not None and not self.deaf:
             self.commands.append(command)
             if command.request is OperatorRequest.HOLD and self.mode is State.RUN:
                 self.mode = State.HOLD
@@ -73,6 +76,9 @@ class ControlStub:
         )
         self._tick += 1
 
+    def kill(self) -> None:
+        self._ticks = 0
+
     @property
     def requests(self) -> list[OperatorRequest]:
         return [command.request for command in self.commands if command.request is not None]
@@ -84,7 +90,7 @@ class ScriptedOperator:
     def __init__(self, answer: Callable[[str], list[OperatorCommand]] = lambda mode: []) -> None:
         self._answer = answer
 
-    def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
+    def commands(self, now_ns: int, mode: str, failed: bool = False) -> list[OperatorCommand]:
         return self._answer(mode)
 
 
@@ -116,6 +122,7 @@ def make_loop() -> Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]:
             log,
             clock,
             control.alive,
+            kill=control.kill,
         )
         return control, loop, log
 
@@ -180,7 +187,7 @@ def test_after_ctrl_c_the_operator_cannot_start_the_robot(
 
     def answer(mode: str) -> list[OperatorCommand]:
         if not loop.interrupts:
-            loop.interrupts.append(signal.SIGINT)
+            loop.interrupts += [signal.SIGINT] if mode else []
             return []
         return [OperatorCommand(request) for request in requests]
 
@@ -222,3 +229,78 @@ def test_a_failure_ends_the_run_if_the_robot_does_not_stand_yet(
     assert loop.run().held == 0
     assert loop.quitting
     assert control.commands[-1].quit
+
+
+def test_ctrl_c_before_the_first_observation_ends_the_run(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def answer(mode: str) -> list[OperatorCommand]:
+        loop.interrupts[:] = [signal.SIGINT]
+        return []
+
+    control, loop, log = make_loop(operator=ScriptedOperator(answer))
+    monkeypatch.setattr(control, "receive", lambda timeout_s=0.0: iter(()))
+    loop.run()
+    assert loop.quitting
+    assert control.commands[-1].quit
+    assert log.ticks == []
+
+
+def test_a_control_process_that_ignores_ctrl_c_is_killed(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+) -> None:
+    def answer(mode: str) -> list[OperatorCommand]:
+        loop.interrupts[:] = [signal.SIGINT] * 2 if mode else []
+        return []
+
+    control, loop, log = make_loop(operator=ScriptedOperator(answer))
+    control.deaf = True
+    loop.run()
+    assert not loop.quitting, "the watchdog must damp"
+    assert len(log.ticks) * TICK_NS == pytest.approx(0.5e9, abs=2.1 * TICK_NS)
+
+
+def test_events_of_the_planner_are_logged_once(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+) -> None:
+    control, loop, log = make_loop(fails_at=1000)
+    receive = control.receive
+
+    def lossy(timeout_s: float = 0.0) -> Iterator[list[bytes]]:
+        """Three observations are lost."""
+        if control._tick == 5:
+            control._tick = 8
+        yield from receive(timeout_s)
+
+    control.receive = lossy  # type: ignore[method-assign]
+    summary = loop.run()
+    expected = "planner lost 3 observations: recurrence restarted"
+    assert [event for tick in log.ticks for event in tick.events].count(expected) == 1
+    assert summary.events.count(expected) == 1
+
+
+def test_all_waiting_observations_are_received_at_once(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+) -> None:
+    control, loop, log = make_loop(fails_at=1000)
+    receive, waiting = control.receive, [100]
+
+    def full(timeout_s: float = 0.0) -> Iterator[list[bytes]]:
+        for _ in range(max(1, min(waiting[0], MAX_RECEIVED))):
+            yield from receive(timeout_s)
+        waiting[0] -= MAX_RECEIVED
+
+    control.receive = full  # type: ignore[method-assign]
+    summary = loop.run()
+    assert summary.ticks == len(log.ticks) == 200
+    assert summary.planned == 101
+
+
+def test_a_failure_before_the_robot_stands_is_not_reported_as_a_hold(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, loop, _ = make_loop(mode=State.INIT)
+    loop.run()
+    assert "held" not in capsys.readouterr().err

@@ -127,6 +127,49 @@ def test_an_overheated_robot_stays_held_when_its_temperatures_stop_arriving() ->
     assert "no longer report temperatures" in rig.run(5.0, replace(HEALTHY, temperature=None)).hold
 
 
+@pytest.mark.parametrize("columns", [1, 2])
+def test_a_hot_motor_whose_sensor_fails_stays_held_until_it_reports_that_it_is_cool(
+    columns: int,
+) -> None:
+    rig = WatchRig()
+
+    def at(degrees: float) -> MotorReadings:
+        return replace(heated(ANKLE, 35.0, degrees), temperature=temperatures(degrees))
+
+    def temperatures(degrees: float) -> np.ndarray:
+        found = np.full((29, columns), 35.0)
+        found[ANKLE, -1] = degrees
+        return found
+
+    assert "left_ankle_roll_joint is too hot" in rig.run(1.0, at(125.0)).hold
+    verdict = rig.run(5.0, at(np.nan))
+    assert "left_ankle_roll_joint was too hot and no longer reports a temp" in verdict.hold
+    assert verdict.arming_refusal
+    assert rig.run(0.1, at(40.0)) == MotorVerdict()
+    assert rig.run(1.0, at(np.nan)) == MotorVerdict(), "it was cool when it was last seen"
+
+
+def test_each_of_two_hot_motors_must_report_that_it_is_cool() -> None:
+    rig = WatchRig()
+    temperature = HEALTHY.temperature.copy()
+    temperature[[KNEE, ANKLE], 1] = 125.0
+    assert rig.run(1.0, replace(HEALTHY, temperature=temperature)).hold
+    temperature = HEALTHY.temperature.copy()
+    temperature[ANKLE, 1] = np.nan
+    assert "left_ankle_roll_joint" in rig.run(1.0, replace(HEALTHY, temperature=temperature)).hold
+    assert rig.run(0.1) == MotorVerdict()
+
+
+def test_an_overloaded_robot_stays_held_when_its_status_stops_arriving() -> None:
+    rig = WatchRig()
+    faults = np.zeros(29, np.int64)
+    faults[KNEE] = 0x1
+    assert rig.run(1.0, replace(HEALTHY, faults=faults)).hold
+    hold = rig.run(1.0, replace(HEALTHY, faults=None)).hold
+    assert "left_knee_joint reports overcurrent (0x1); motors no longer report their status" in hold
+    assert rig.run(0.1) == MotorVerdict()
+
+
 def test_heat_is_warned_of_while_a_motor_is_overloaded() -> None:
     rig, hot = WatchRig(), heated(ANKLE, 35.0, 95.0)
     faults = np.zeros(29, np.int64)

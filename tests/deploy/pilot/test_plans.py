@@ -19,12 +19,15 @@ class ScriptedPlanner:
     """Returns the plans in ``replies``, once."""
 
     alive = True
+    receives = True
 
     def __init__(self) -> None:
         self.replies: list[PlanMessage] = []
+        self.events: list[str] = []
 
-    def submit(self, observation: ObservationMessage) -> None:
-        pass
+    def submit(self, observation: ObservationMessage) -> bool:
+        self.events += observation.events if self.receives else ()
+        return self.receives
 
     def poll(self, now_ns: int) -> list[PlanMessage]:
         replies, self.replies = self.replies, []
@@ -75,3 +78,13 @@ def test_a_planner_is_silent_since_the_first_observation_without_a_plan(
         pilot.send_observation(tick * TICK_NS, DEPTH, STATE)
         pilot.update_state(Facts(tick * TICK_NS))
     np.testing.assert_allclose(silence, np.arange(1, 101) / PLANNER_HZ)
+
+
+def test_events_are_kept_until_an_observation_is_sent() -> None:
+    pilot, planner = started()
+    planner.receives = False
+    pilot.send_observation(TICK_NS, DEPTH, STATE, ("run -> damp: emergency stop",))
+    pilot.add_events(["later"])
+    planner.receives = True
+    pilot.send_observation(2 * TICK_NS, DEPTH, STATE, pilot.take_events())
+    assert planner.events == ["run -> damp: emergency stop", "later"]

@@ -282,6 +282,18 @@ class ShownImage:
         pass
 
 
+def test_an_image_that_arrives_together_with_a_newer_one_is_not_lost() -> None:
+    camera = ZmqDepthCamera()
+    camera._subscriber = SimpleNamespace(older=0)  # type: ignore[assignment]
+    for sequence, older in ((1, 0), (2, 0), (4, 1)):
+        camera._subscriber.older = older
+        assert camera._handle(encode_frame(DepthFrame(sequence, FOV, noise(sequence))), sequence)
+    assert camera.arrivals.stats(5).lost == 0.0
+    camera._subscriber.older = 0
+    assert camera._handle(encode_frame(DepthFrame(6, FOV, noise())), 6)
+    assert camera.arrivals.stats(6).lost == 1 / 5
+
+
 def test_depth_server_publishes_each_image_once() -> None:
     shown = ShownImage()
     server = DepthServer(shown, FOV, "127.0.0.1", 0)

@@ -38,14 +38,17 @@ def test_newest_usable_message_is_taken(
     listen: Callable[..., Subscriber],
 ) -> None:
     tried: list[bytes] = []
+    older: list[int] = []
 
     def take(message: bytes, time_ns: int) -> bool:
         tried.append(message)
+        older.append(listener.older)
         return message.startswith(b"good")
 
     listener = listen(take)
     assert listener._handle_newest([b"good 1", b"bad", b"good 2", b"bad", b"bad"])
     assert tried == [b"bad", b"bad", b"good 2"]
+    assert older == [4, 3, 2]
 
 
 def test_processing_time_of_a_flood_is_bounded(listen: Callable[..., Subscriber]) -> None:

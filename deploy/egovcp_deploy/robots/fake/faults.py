@@ -29,7 +29,8 @@ class InjectedFaults:
     other_publisher: bool = False  # another program holds every joint where it is
     mode: int | None = None  # report this value of Unitree's `mode_machine` field
     hot_motor: tuple[int, float] | None = None
-    """Joint whose motor reports this temperature, deg C (of its winding, if it reports two)."""
+    """Joint whose motor's winding has this temperature, deg C. Detailed states report it; others
+    report its mean with the casing's 35 deg C."""
     dropped_motor: int | None = None  # joint without torque; only detailed states report it
     push: tuple[float, ...] | None = None  # change of the base's velocity, m/s, world x, y; once
     release: bool = False  # the gantry releases the robot, once
