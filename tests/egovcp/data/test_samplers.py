@@ -1,6 +1,8 @@
 """Batches from episodes in memory, and batches prefetched in a thread."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -238,3 +240,26 @@ def test_errors_of_the_thread_are_raised_by_next(
     for _ in range(2):
         with pytest.raises(DataError, match="is damaged"):
             next(ahead)
+
+
+_ENDS_DURING_A_DOWNLOAD = """
+import threading
+from egovcp.data.samplers import PrefetchIterator
+
+class Sampler:
+    batches = 0
+
+    def state_dict(self):
+        return {}
+
+    def __next__(self):
+        if self.batches:
+            threading.Event().wait()  # as for a file of an unreachable Hub
+        self.batches += 1
+
+next(PrefetchIterator(Sampler()))
+"""
+
+
+def test_a_process_does_not_wait_for_a_prefetched_batch_at_its_end() -> None:
+    subprocess.run([sys.executable, "-c", _ENDS_DURING_A_DOWNLOAD], check=True, timeout=30)

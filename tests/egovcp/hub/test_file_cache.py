@@ -1,7 +1,5 @@
 """Files of a commit that are downloaded when they are needed."""
 
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -91,26 +89,3 @@ def test_files_are_those_of_the_opened_commit(
     other = dict(publication.contents) | {DATA: Content(b"other")}
     publish(Publication("me/small", other, "another version"), quick)
     assert cache.get(DATA).read_bytes() == publication.contents[DATA].source
-
-
-_ENDS_DURING_A_DOWNLOAD = """
-import threading
-from egovcp.data.samplers import PrefetchIterator
-
-class Sampler:
-    batches = 0
-
-    def state_dict(self):
-        return {}
-
-    def __next__(self):
-        if self.batches:
-            threading.Event().wait()  # as for a file of an unreachable Hub
-        self.batches += 1
-
-next(PrefetchIterator(Sampler()))
-"""
-
-
-def test_a_process_does_not_wait_for_a_prefetched_batch_at_its_end() -> None:
-    subprocess.run([sys.executable, "-c", _ENDS_DURING_A_DOWNLOAD], check=True, timeout=30)
