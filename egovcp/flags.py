@@ -8,6 +8,7 @@ can set the other options of the group.
 from __future__ import annotations
 
 import dataclasses
+import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -178,7 +179,7 @@ def config_file(file: str) -> dict[str, Any]:
         UsageError: it cannot be read.
     """
     try:
-        return read_config(Path(file))
+        return read_config(Path(os.path.expanduser(file)))
     except OSError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
     except UnsafeFileError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
-from egovcp.log.async_sink import AsyncFanout, AsyncSink
+from egovcp.log.async_sink import AsyncFanout, AsyncSink, warn_on_stderr
 from egovcp.log.mcap import McapSink
 from egovcp.log.tick import CameraView, Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
@@ -63,9 +63,11 @@ def recording(
     viewer: Viewer | None,
     blocking: bool,
     number: int = 0,
+    warn: Callable[[str], None] = warn_on_stderr,
 ) -> Iterator[Sink]:
     """Sinks of rollout ``number``. If ``blocking``, the loop may wait for the disk, as in simulated
-    time; else each sink, like any viewer, runs in a separate process."""
+    time; else each sink, like any viewer, runs in a separate process, and ``warn`` gets their
+    messages."""
     stem = folder / f"rollout-{number}"
     mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
     files: dict[str, Sink] = {mcap.name: McapSink(mcap)}
@@ -81,12 +83,14 @@ def recording(
     if viewer is not None:
         from egovcp.log.rerun import RerunSink
 
-        viewers.append(AsyncSink(RerunSink(viewer), "Rerun"))
+        viewers.append(AsyncSink(RerunSink(viewer), "Rerun", warn=warn))
     sink: Sink
     if blocking:
         sink = Fanout([*files.values(), *viewers])
     else:
-        sink = AsyncFanout([*(AsyncSink(file, name) for name, file in files.items()), *viewers])
+        sink = AsyncFanout(
+            [*(AsyncSink(f, name, warn=warn) for name, f in files.items()), *viewers]
+        )
     with closing(sink):
         sink.open(info)
         yield sink

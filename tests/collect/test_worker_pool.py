@@ -4,12 +4,14 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from multiprocessing import Pipe
+from pathlib import Path
 
 import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.worker_pool import MAX_ATTEMPTS, WorkerPool, WorkerReport
+from egovcp_collect.config import CollectConfig
+from egovcp_collect.worker_pool import MAX_ATTEMPTS, Worker, WorkerPool, WorkerReport
 
 _NUM_ENVS = 2
 
@@ -144,3 +146,10 @@ def test_an_episode_that_always_hangs_raises() -> None:
 def test_errors_of_workers_are_raised_at_once(failure: Exception) -> None:
     with pytest.raises(type(failure)):
         _run(_once(lambda worker: WorkerReport(0, error=failure), 7))
+
+
+def test_the_death_of_a_worker_tells_its_exit_code(tmp_path: Path) -> None:
+    worker = Worker(CollectConfig(), tmp_path)
+    worker.process.kill()
+    assert worker.death == "ended with exit code -9 (out of memory? try fewer --num_workers)"
+    worker.kill()

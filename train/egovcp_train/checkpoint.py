@@ -9,6 +9,7 @@ checkpoints/last -> 000500
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -247,8 +248,10 @@ def require_same_returns(
         where: what the model comes from, for the message.
     """
     is_scaled = bool(state["return_mean"] != 0 or state["return_std"] != 1)
+    discount = float(state["discount"])
+    gamma = returns.gamma if math.isclose(returns.gamma, discount, rel_tol=1e-6) else discount
     options = {
-        "gamma": (f"{returns.gamma:.6g}", f"{float(state['discount']):.6g}"),
+        "gamma": (f"{returns.gamma:.6g}", f"{gamma:.6g}"),
         "scale": (returns.scale, "dataset" if is_scaled else "none"),
     }
     for name, (given, found) in options.items():

@@ -28,6 +28,7 @@ from egovcp_collect.dataset.statistics import DatasetStatistics, TaskStatistics,
 
 CARD: Final = "README.md"
 ASSETS: Final = "assets"
+_WALK: Final = {"eta", "boundary", "step_ticks"}  # options of the random walk
 _PLOTS: Final = ("events", "returns", "actions", "depth")
 _BOUNDARY: Final = {"reflect": "reflected at the faces of the box", "clip": "clipped to the box"}
 
@@ -107,7 +108,7 @@ def _render(
         complete=len(parts) == 1 and numbers == [*range(len(reader))],
         versions=", ".join(f"{k} {v}" for k, v in versions.items()) or "not recorded",
         controller_id=reader.controller_id,
-        eta=config.get("eta"),
+        eta=config.get("eta") if len(parts) == 1 or config.keys() >= _WALK else None,
         boundary=_BOUNDARY.get(config.get("boundary", ""), "kept inside the box"),
         step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
         ranges=ranges,

@@ -119,7 +119,7 @@ class ControlLoop:
         self._velocity = VelocityCommand()
         self._motor_watch = MotorWatch()
         self._command: MotorCommand | None = None  # the last one written
-        self.commanding = False  # whether motor commands are written, see `tick`
+        self.commanding = False  # whether the last tick wrote a motor command
         self._count = 0
         self._pending = False  # o_t has been sent, a_t is not decided
         self._reading: LowState | None = None
@@ -131,8 +131,8 @@ class ControlLoop:
         return self.pilot.supervisor.state
 
     def tick(self, now_ns: int, command: OperatorCommand = _NO_COMMAND) -> None:
-        """One control tick at ``now_ns``. It writes a motor command, but in INIT only once
-        `BridgeRobot.refusal` has been empty: another program may balance the robot."""
+        """One control tick at ``now_ns``. It writes a motor command, but in INIT only while
+        `BridgeRobot.refusal` is empty: another program may balance the robot."""
         reading, image = self._read(), self._camera.read()
         planner_tick = self._count % CONTROLLER_TICKS_PER_PLAN == 0
         self.pilot.receive_plans(now_ns)
@@ -161,7 +161,7 @@ class ControlLoop:
             )
             self._pending = True
         motor_command = self._motor_command(now_ns, before, reading, state)
-        self.commanding = self.commanding or self.state is not State.INIT or not self._body.refusal
+        self.commanding = self.state is not State.INIT or not self._body.refusal
         if self.commanding:
             self._command = motor_command
             self._body.write(motor_command)

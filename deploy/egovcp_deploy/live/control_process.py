@@ -3,7 +3,7 @@
 It owns the connection to the robot. If the planner's process ends or hangs, the robot is held.
 On a normal exit, an exception or a signal that can be handled its last commands damp the motors. If
 it is killed, the watchdog of the planner's process does; if both are gone, the motors keep the last
-command. A robot that it has never commanded is not damped: another program may balance it.
+command. A robot that it does not command is not damped: another program may balance it.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def control_process(
 ) -> None:
     """Main function of the process; returns on a quit command, on SIGTERM, SIGHUP or SIGQUIT, or
     2 s after the planner's process ``parent`` has ended, once the motors are damped. ``address`` is
-    that of the link between them; ``commanded``, in shared memory, becomes true with the first
-    motor command."""
+    that of the link between them; ``commanded``, in shared memory, tells whether motor commands are
+    sent (see `ControlLoop.tick`)."""
     commanded = c_bool(False) if commanded is None else commanded
     os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process

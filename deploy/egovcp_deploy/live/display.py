@@ -52,10 +52,11 @@ class Display:
 
     def _run(self) -> None:
         _Bar.set_lock(threading.RLock())
-        # The errors are those of a closed terminal.
+        # The errors are those of a closed terminal or pipe; the other stream may still be open.
         with suppress(OSError, ValueError), _Bar(unit="tick", desc="live") as bar:
             while (item := self._queue.get()) is not None:
-                _print(bar, item)
+                with suppress(OSError, ValueError):
+                    _print(bar, item)
 
 
 def _print(bar: Any, item: Tick | str) -> None:

@@ -63,12 +63,12 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
             with (
                 open_operator(config.operator) as operator,
                 open_viewer(config.log) as viewer,
-                recording(folder, info, config.log, viewer, blocking=False) as sink,
                 closing(Display()) as display,
+                recording(folder, info, config.log, viewer, False, warn=display.warn) as sink,
                 running_control(robot) as control,
             ):
                 # Another Ctrl-C must not end the program before the logs are complete.
-                signals.enter_context(stop_on_signal(signals=(signal.SIGINT,), interrupt=False))
+                interrupts = signals.enter_context(stop_on_signal((signal.SIGINT,), False))
                 process, watchdog = control.process, control.watchdog
                 loop = PlannerLoop(
                     runner,
@@ -85,7 +85,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
                 summary = loop.run(display.show)
                 silent = not (summary.ticks or summary.failure or loop.quitting)
                 died = not process.is_alive()
-                stop_control(process, watchdog)
+                stop_control(process, watchdog, interrupts)
                 if loop.interrupts and not (summary.ticks or summary.failure):
                     raise KeyboardInterrupt
                 if silent and died:

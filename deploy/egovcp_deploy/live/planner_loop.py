@@ -235,9 +235,8 @@ class PlannerLoop:
             message = f"the planner failed: {describe_failure(error)}"
             self._events.append(message)
             if self._mode not in ("", State.INIT):
-                message += (
-                    "; the robot is held until the operator ends the run: Ctrl-C twice damps it"
-                )
+                end = "the operator ends the run" if self._stays else "--operator.duration is over"
+                message += f"; the robot is held until {end}: Ctrl-C twice damps it"
             with suppress(Exception):  # the terminal may be what failed
                 self._warn(message)
 
@@ -261,11 +260,11 @@ class PlannerLoop:
             self._send(OperatorCommand(quit=True), "the planner failed before the robot stood")
 
     def _interrupt_commands(self, interrupts: int, now_ns: int) -> list[OperatorCommand]:
-        """First Ctrl-C: hold, ease the hands, and end the run unless ``stays``; before the first
-        observation, which may never arrive, end it at once. Second: damp."""
+        """First Ctrl-C: hold, ease the hands, and end the run unless ``stays``; before the robot
+        stands, end it at once. Second: damp."""
         if not interrupts:
             return []
-        if not self._mode:
+        if self._mode in ("", State.INIT):
             return [OperatorCommand(quit=True)]
         if interrupts >= 2:
             self._estop_ns = now_ns if self._estop_ns is None else self._estop_ns
@@ -273,10 +272,8 @@ class PlannerLoop:
             return [estop] if self._damped_ns is None else []
         if self._held_ns is None:
             self._held_ns = now_ns
-            return [OperatorCommand(OperatorRequest.HOLD)]
-        if now_ns - self._held_ns <= EASE_S * _NS:
-            return []
-        return [OperatorCommand(OperatorRequest.HOLD, quit=not self._stays)]
+        eased = now_ns - self._held_ns > EASE_S * _NS
+        return [OperatorCommand(OperatorRequest.HOLD, quit=eased and not self._stays)]
 
     def _check_estop(self, now_ns: int) -> None:
         """Kill the control process if it has not followed the emergency stop of Ctrl-C."""

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from ctypes import c_bool
 from multiprocessing.connection import wait
@@ -22,6 +22,8 @@ from egovcp_deploy.live.link import Link
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 
 _END_S: Final = 5.0  # for a process to end by itself
+_INTERRUPTED_END_S: Final = 0.5  # the same after another Ctrl-C
+_SLICE_S: Final = 0.05
 _WATCHDOG_ROUNDS: Final = 20  # of damping commands, 50 ms each
 
 
@@ -68,20 +70,30 @@ def running_control(options: RobotOptions) -> Iterator[RunningControl]:
                 stop_control(process, watchdog)
 
 
-def stop_control(process: BaseProcess, watchdog: DampingWatchdog) -> None:
+def stop_control(
+    process: BaseProcess, watchdog: DampingWatchdog, interrupts: Sequence[int] = ()
+) -> None:
     """End the control process: wait for it if it has a quit command, then SIGTERM, on which it
-    damps the motors too, then SIGKILL, after which ``watchdog`` damps them."""
+    damps the motors too, then SIGKILL, after which ``watchdog`` damps them. A SIGINT that is added
+    to ``interrupts`` shortens the waits."""
     if watchdog.expected():
-        process.join(_END_S)
+        _join(process, interrupts)
     if process.is_alive():
         watchdog.expected = lambda: True
         process.terminate()
-        process.join(_END_S)
+        _join(process, interrupts)
     if process.is_alive():
         watchdog.expected = lambda: False
         process.kill()
         process.join(_END_S)
     watchdog.join_if_ended()
+
+
+def _join(process: BaseProcess, interrupts: Sequence[int]) -> None:
+    waits = round(_END_S / _SLICE_S)
+    while waits > 0 and process.is_alive():
+        process.join(_SLICE_S)
+        waits = min(waits - 1, round(_INTERRUPTED_END_S / _SLICE_S)) if interrupts else waits - 1
 
 
 @contextmanager
@@ -98,7 +110,7 @@ def standby_body(config: BridgeConfig) -> Iterator[BridgeRobot]:
 
 class DampingWatchdog:
     """A thread that damps the robot over ``body``, a connection that nothing else uses, if the
-    control process ends although ``expected()`` is false. If it has never sent a motor command
+    control process ends although ``expected()`` is false. If it does not send motor commands
     (``commanded()`` is false), the robot is not ours to damp."""
 
     def __init__(

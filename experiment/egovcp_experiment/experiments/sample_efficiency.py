@@ -18,9 +18,12 @@ from egovcp_experiment.report import ExperimentReport, Part
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     grid.collected = max(1.0, *config.data.parts)
-    if grid.collected > 1 and config.data.roots:
+    given = sorted(set(config.data.roots) & set(config.tasks))
+    if grid.collected > 1 and given:
+        parts = [part for part in config.data.parts if part <= 1]
         raise UsageError(
-            f"--data.parts holds {grid.collected:g}: of a given dataset (--data.roots), at most 1"
+            f"--data.parts={list(config.data.parts)}: parts of the dataset given for {given[0]} "
+            f"(--data.roots) are at most 1; give --data.parts={parts}"
         )
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",

@@ -280,12 +280,14 @@ def test_the_emergency_stop_damps_a_robot_that_another_program_commands(make_rig
     assert all(limp(command) for command in rig.body.commands)
 
 
-def test_commands_continue_when_another_program_begins_to_command(make_rig: Make) -> None:
+def test_commands_end_when_another_program_begins_to_command_before_the_robot_stands(
+    make_rig: Make,
+) -> None:
     rig = make_rig()
     rig.run(0.1)
     rig.faults.refusal = "another publisher is alive"
     rig.run(0.1)
-    assert len(rig.body.commands) == 10
+    assert len(rig.body.commands) == 5
 
 
 def test_the_operators_velocity_is_sent_only_while_running(make_rig: Make) -> None:

@@ -237,7 +237,8 @@ def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., LiveRun
     assert eventually(lambda: not run.holds)
     stderr = run.stderr()
     assert run.program.returncode == 6, stderr
-    assert "emergency stop" in stderr
+    # The latter if the machine was too busy for the control process to answer in time.
+    assert "emergency stop" in stderr or "the control process died" in stderr
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[LiveSummar
             "recording": recording,
             "run_info": lambda *arguments: SimpleNamespace(backend=""),
             "running_control": running_control,
-            "stop_control": lambda process, watchdog: None,
+            "stop_control": lambda process, watchdog, interrupts: None,
         }
         for name, value in replaced.items():
             monkeypatch.setattr(drive_module, name, value)

@@ -247,6 +247,19 @@ def test_ctrl_c_before_the_first_observation_ends_the_run(
     assert log.ticks == []
 
 
+def test_ctrl_c_before_the_robot_stands_ends_the_run_without_an_emergency_stop(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
+) -> None:
+    def answer(mode: str) -> list[OperatorCommand]:
+        loop.interrupts[:] = [signal.SIGINT] * 2 if mode else []
+        return []
+
+    control, loop, _ = make_loop(operator=ScriptedOperator(answer), mode=State.INIT)
+    loop.run()
+    assert control.commands[-1].quit
+    assert OperatorRequest.ESTOP not in control.requests
+
+
 def test_a_control_process_that_ignores_ctrl_c_is_killed(
     make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
 ) -> None:

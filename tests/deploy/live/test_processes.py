@@ -52,6 +52,13 @@ def test_a_process_gets_sigterm_before_sigkill_after_which_the_watchdog_damps(
         assert control.tried.index("signal") < control.tried.index("kill")
 
 
+def test_another_interrupt_shortens_the_wait_for_a_hanging_process() -> None:
+    watchdog = SimpleNamespace(expected=lambda: True, join_if_ended=lambda: None)
+    control = Control("kill", watchdog)
+    stop_control(control, watchdog, interrupts=[2])
+    assert control.tried.index("kill") < 30  # waits of 50 ms; 200 without an interrupt
+
+
 @pytest.mark.parametrize(
     ("commanded", "expected", "damped"),
     [(True, False, 1), (True, True, 0), (False, False, 0)],

@@ -86,5 +86,5 @@ def test_parts_are_those_of_a_given_dataset(tmp_path: Path) -> None:
     (line,) = EXPERIMENTS["sample-efficiency"].report(config, records).findings
     assert line.startswith("wall: 50.0% success from 40k steps, 50.0% from 80k steps")
     more = replace(config, data=replace(config.data, parts=(1.0, 2.0)))
-    with pytest.raises(UsageError, match=r"--data\.parts holds 2"):
+    with pytest.raises(UsageError, match=r"give --data\.parts=\[1\.0\]"):
         EXPERIMENTS["sample-efficiency"].cells(more)
