@@ -78,7 +78,7 @@ def test_all_rollouts_are_shown_in_one_spawned_viewer(
     shown: list[MemorySink] = []
     starts: list[str] = []
 
-    def sink(log: object, name: str) -> MemorySink:
+    def sink(log: object, name: str, warn: object) -> MemorySink:
         shown.append(MemorySink())
         return shown[-1]
 
