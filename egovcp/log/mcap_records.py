@@ -106,7 +106,7 @@ class RecordFile:
         if size < _FOOTER.size:
             return None
         file.seek(size - _FOOTER.size)
-        opcode, length, start, _, checksum, magic = _FOOTER.unpack(file.read())
+        opcode, length, start, _, checksum, magic = _FOOTER.unpack(file.read(_FOOTER.size))
         summary_bytes = size - len(MAGIC) - 4 - start
         if (opcode, length, magic) != (Opcode.FOOTER, 20, MAGIC):
             return None
