@@ -16,6 +16,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +34,7 @@ from egovcp.files import (
     read_bytes,
     removed_on_error,
     sha256,
+    user_path,
     write_bytes,
 )
 from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
@@ -124,13 +126,10 @@ def save_artifact(
         "input_features": input_features(model.robot),
         "output_features": output_features(model.robot),
     }
-    with removed_on_error(path.with_name(path.name + ".partial")) as work:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
+    with replaced_folder(path) as work:
         write_artifact(
             work, config, model.state_dict(), provenance, processors(model.robot), model.robot
         )
-        _replace(path, work)
 
 
 def write_artifact(
@@ -173,18 +172,23 @@ def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
         raise ArtifactError(f"{path}: the provenance of a policy must hold its controller_id")
 
 
-def _replace(path: Path, new: Path) -> None:
-    """Rename folder ``new`` to ``path``, replacing it; on an error the old folder stays."""
+@contextmanager
+def replaced_folder(path: Path) -> Iterator[Path]:
+    """A new folder that replaces ``path`` at the end of the block; the old one stays on an error."""
     old = path.with_name(path.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if path.exists():
-        path.rename(old)
-    try:
-        new.rename(path)
-    except OSError:
-        if old.exists():
-            old.rename(path)
-        raise
+    with removed_on_error(path.with_name(path.name + ".partial")) as new:
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir(parents=True)
+        yield new
+        shutil.rmtree(old, ignore_errors=True)
+        if path.exists():
+            path.rename(old)
+        try:
+            new.rename(path)
+        except OSError:
+            if old.exists():
+                old.rename(path)
+            raise
     shutil.rmtree(old, ignore_errors=True)
 
 
@@ -269,7 +273,7 @@ def policy_folder(path: str) -> Path:
     """Folder that ``path`` names unless it is a Hub id: a shipped policy, else a folder."""
     if path in shipped_policies():
         return PRETRAINED / path
-    return Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
+    return user_path(path)
 
 
 def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:

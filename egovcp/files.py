@@ -47,6 +47,11 @@ class UnsafeFileError(ValueError):
     """A file is not a regular file, is too large, or holds invalid or unsafe JSON."""
 
 
+def user_path(path: str | Path) -> Path:
+    """The path with ``~`` replaced by the home folder."""
+    return Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
+
+
 def require_regular(path: Path, limit_bytes: int | None = None) -> os.stat_result:
     """Raise unless ``path`` is a regular file of bounded size; links are followed.
 

@@ -8,7 +8,6 @@ can set the other options of the group.
 from __future__ import annotations
 
 import dataclasses
-import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any, Final
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
-from egovcp.files import UnsafeFileError, read_text
+from egovcp.files import UnsafeFileError, read_text, user_path
 from egovcp.removed_options import refuse_removed_flag
 from egovcp.values import (
     WrongValue,
@@ -179,7 +178,7 @@ def config_file(file: str) -> dict[str, Any]:
         UsageError: it cannot be read.
     """
     try:
-        return read_config(Path(os.path.expanduser(file)))
+        return read_config(user_path(file))
     except OSError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
     except UnsafeFileError as error:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from egovcp.bounds import as_flag_value, leaf_options
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.files import UnsafeFileError, partial_path, require_regular, write_text
+from egovcp.files import UnsafeFileError, partial_path, require_regular, user_path, write_text
 
 STDOUT: Final = "-"
 """Standard output, where an option allows it."""
@@ -54,7 +54,7 @@ def require_output_file(file: str, option: str) -> None:
         UsageError: another kind of file exists, a parent is a file, or the name is too long.
         EnvironmentFailure: no permission, or a read-only file system.
     """
-    path, named = Path(os.path.expanduser(file)), f"{option}={as_flag_value(file)}"
+    path, named = user_path(file), f"{option}={as_flag_value(file)}"
     try:
         if os.path.lexists(path):
             require_regular(path)
@@ -101,7 +101,7 @@ def write_report(file: str, content: Any, durable: bool = True) -> None:
     """
     if not file:
         return
-    path = Path(os.path.expanduser(file))
+    path = user_path(file)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n", durable)

@@ -11,7 +11,8 @@ from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
 from egovcp.sim.config import EnvConfig, require_memory_for_robots, short_episodes
-from egovcp.sim.scenario import HELD_OUT, Scenario
+from egovcp.sim.policies import require_ordered_steps
+from egovcp.sim.scenario import Scenario, require_training_seed
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT
 
@@ -76,11 +77,7 @@ class CollectConfig:
         check_cores(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
-        if self.seed >= HELD_OUT:
-            raise UsageError(
-                f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
-                "beyond are for evaluation"
-            )
+        require_training_seed(self.seed)
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes)
         require_memory_for_robots("--num_envs", self.num_envs, robots)
@@ -90,12 +87,7 @@ class CollectConfig:
                 f"--mix.{unknown[0]}: not a task of --task={self.task}; expected one of "
                 f"{', '.join(tasks)}"
             )
-        shortest, longest = self.step_ticks
-        if shortest > longest:
-            raise UsageError(
-                f"--step_ticks={[shortest, longest]}: expected 1 <= shortest <= longest, planner "
-                "ticks"
-            )
+        shortest, longest = require_ordered_steps(self.step_ticks)
         reachable = min(2.0, shortest * ACTION_RATE_LIMIT)
         if self.eta > reachable:
             raise UsageError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, Final
 
 from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
-from egovcp.files import read_json
+from egovcp.files import read_json, user_path
 from egovcp.terminal import echo
 from egovcp.values import differences
 from egovcp_deploy.scores import EpisodeScore, aligned, eval_scores, paired
@@ -90,8 +89,8 @@ def compare(config: CompareConfig) -> None:
     """Print one line for each task that both runs have played; raises `UsageError` if they cannot
     be compared, `DataError` if an eval_run.json cannot be read."""
     config.check()
-    run = load_evaluation(Path(os.path.expanduser(config.run)))
-    other = load_evaluation(Path(os.path.expanduser(config.other or config.run)))
+    run = load_evaluation(user_path(config.run))
+    other = load_evaluation(user_path(config.other or config.run))
     seeds = [each.config["seed"] for each in (run, other)]
     if seeds[0] != seeds[1]:
         raise UsageError(

@@ -9,7 +9,6 @@ from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
-from egovcp.sim.tasks.registry import DEFAULT_TASK
 from egovcp_deploy.live.hardware import RobotOptions
 from egovcp_deploy.options import SEEDS, encoded
 from egovcp_deploy.recording import LogOptions
@@ -48,10 +47,10 @@ class DeployConfig:
     dry_run: bool = False
     """Only check what a run of a unitree_g1 needs, and print go or no-go per check; nothing
     moves."""
-    task: str = DEFAULT_TASK
-    """Scene of the simulated robot: a name from `egovcp-task list`, such as ball or sequence
-    (several in one episode, --env.sequence.parts), or package.module:Class. It is no input of the
-    policy."""
+    task: str = ""
+    """Scene of the simulated robot: a name from `egovcp-task list`, such as ball (if empty) or
+    sequence (several in one episode, --env.sequence.parts), or package.module:Class; of a real
+    robot only recorded. It is no input of the policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts in simulation; a unitree_g1 makes one."""
     seed: int = bounded(0, least=0, below=SEEDS)

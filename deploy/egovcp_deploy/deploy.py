@@ -32,11 +32,7 @@ _EPILOG: Final = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    # A task that is not given is not recorded as that of a real robot.
-    unnamed = {"task": ""}
-    return run_command(
-        DeployConfig, deploy, argv, prog=PROG, epilog=_EPILOG, defaults=lambda _: unnamed
-    )
+    return run_command(DeployConfig, deploy, argv, prog=PROG, epilog=_EPILOG)
 
 
 def deploy(config: DeployConfig) -> None:

@@ -6,7 +6,6 @@ in this file have not been verified on hardware.
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections.abc import Callable
@@ -17,11 +16,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import torch
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.hardware import available_cores
+from egovcp.files import user_path
 from egovcp.outputs import nearest_existing, require_writable
 from egovcp.plan import blank_observation, time_left_until
 from egovcp.policy_options import load_policy
@@ -35,7 +33,7 @@ from egovcp_deploy.live.control_process import CONTROL_PRIORITY, NO_PRIORITY, ra
 from egovcp_deploy.live.hardware import AnyCamera, open_camera
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
 from egovcp_deploy.pilot.pilot import posture
-from egovcp_deploy.pilot.planner import BUDGET_S, RolloutPolicy, backend_of
+from egovcp_deploy.pilot.planner import BUDGET_S, RolloutPolicy, backend_of, leave_core
 from egovcp_deploy.robots.base import Array, DepthImage, LowState, proprioception
 from egovcp_deploy.robots.bridge import BridgeRobot
 from egovcp_deploy.robots.subscriber import ArrivalStats
@@ -75,14 +73,13 @@ def dry_run(config: DeployConfig) -> None:
     with ThreadPoolExecutor(1) as pool:  # only its thread gets the priority
         granted = pool.submit(raise_priority, CONTROL_PRIORITY).result()
     echo("go     priority: real-time" if granted else f"warn   priority: {NO_PRIORITY}")
-    perform("disk", lambda: check_disk(Path(os.path.expanduser(config.output_dir))))
+    perform("disk", lambda: check_disk(user_path(config.output_dir)))
     artifact = perform(
         "policy",
         lambda: load_policy(config.policy, config.planner),
         lambda found: f"{found.path}, for the controller {found.controller_id}",
     )
-    if "OMP_NUM_THREADS" not in os.environ:  # as many threads as in a run, see `drive`
-        torch.set_num_threads(max(1, available_cores() - 1))
+    leave_core()
     if artifact is not None:
         perform("planner", lambda: check_plan_time(artifact.make_policy(1, config.seed)))
     perform("controller", lambda: check_controller(robot_options.controller, artifact))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
+from egovcp.files import user_path
 from egovcp.hardware import available_cores
 from egovcp.log.picture import AHEAD, PictureSink
 from egovcp.log.tick import RunInfo, Sink, Tick
@@ -83,7 +83,7 @@ class EpisodePlayer:
         if key not in self._policies:
             learned: RolloutPolicy
             if group.controller == PPO:
-                network = ReactiveNetwork.load(Path(os.path.expanduser(config.ppo.path)))
+                network = ReactiveNetwork.load(user_path(config.ppo.path))
                 learned = ReactivePolicy(network, robots)
             else:
                 self._artifact = self._artifact or load_policy(config.policy, config.planner)

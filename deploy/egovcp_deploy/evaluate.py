@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
@@ -16,7 +15,7 @@ from tqdm import tqdm
 from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
-from egovcp.files import write_json
+from egovcp.files import user_path, write_json
 from egovcp.hardware import available_cores
 from egovcp.packages import require_packages
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
@@ -165,7 +164,7 @@ def evaluate(config: EvalConfig) -> None:
     env = encoded(config.env) | {"controller": None}  # its identity is compared instead of its path
     setting = {"low_level_controller": controller_id, "env": env}
     path = config.constant.path
-    constants = load_constants(Path(os.path.expanduser(path)), setting) if path else {}
+    constants = load_constants(user_path(path), setting) if path else {}
     artifact, ppo, backend = None, None, ""
     if PLANNER in config.controller_names:
         artifact = load_policy(config.policy, config.planner)
@@ -174,7 +173,7 @@ def evaluate(config: EvalConfig) -> None:
         policy.prepare()  # compile once, before workers need it
         backend = backend_of(policy)
     if PPO in config.controller_names:
-        ppo = ReactiveNetwork.load(Path(os.path.expanduser(config.ppo.path)))
+        ppo = ReactiveNetwork.load(user_path(config.ppo.path))
         ppo.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
     scores: Scores = {task: {name: [] for name in config.controller_names} for task in config.tasks}

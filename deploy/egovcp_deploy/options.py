@@ -11,6 +11,7 @@ from typing import Any, Final
 import draccus
 
 from egovcp.errors import UsageError
+from egovcp.files import user_path
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
 from egovcp.packages import is_installed, versions_of
@@ -33,7 +34,7 @@ def check_output_dir(path: str) -> Path:
     `UsageError` if none is named or it holds files, `EnvironmentFailure` if it is not writable."""
     if not path:
         raise UsageError("--output_dir is missing; name a new folder for the results")
-    folder = Path(os.path.expanduser(path))
+    folder = user_path(path)
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--output_dir={path} is a file; name a new folder")
     present = sorted(entry.name for entry in folder.iterdir()) if folder.exists() else []

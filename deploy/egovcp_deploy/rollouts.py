@@ -7,7 +7,6 @@ With o_{t+1} the planner receives the action that was sent, and advances its rec
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.files import write_json
+from egovcp.files import user_path, write_json
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.rate import NS_PER_S
@@ -163,7 +162,7 @@ def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> Path:
 def replay(config: DeployConfig, artifact: Artifact) -> Path:
     """Plan again on recorded observations, of at most ``episodes`` recordings. Returns the output
     folder. Raises as `deploy`, and `DataError` for a damaged recording or another controller."""
-    robot = open_recordings(Path(os.path.expanduser(config.robot.recordings)))
+    robot = open_recordings(user_path(config.robot.recordings))
     artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, len(robot.files)))
     return _play(config, artifact, robot, artifact.make_policy(1, config.seed))

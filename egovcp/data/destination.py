@@ -15,6 +15,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.files import user_path
 from egovcp.outputs import nearest_existing, require_writable
 
 
@@ -25,7 +26,7 @@ def resolve_root(root: str | Path) -> Path:
     writers could hold different locks.
     """
     try:
-        return Path(os.path.expanduser(root)).resolve()
+        return user_path(root).resolve()
     except OSError as error:
         raise UsageError(f"{root}: {error.strerror}; give an absolute path") from error
     except RuntimeError as error:

@@ -19,7 +19,7 @@ from egovcp.data import schema
 from egovcp.data.dataset_files import create_json
 from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError, suggest_path
-from egovcp.files import read_json
+from egovcp.files import read_json, user_path
 from egovcp.hub import HubFileCache, RetryPolicy, is_repo_id, snapshot
 
 _RETRY_POLICY = RetryPolicy()
@@ -39,7 +39,7 @@ def lerobot_home() -> Path:
     """``$HF_LEROBOT_HOME``, the folder in which LeRobot keeps datasets by id."""
     from huggingface_hub.constants import HF_HOME
 
-    return Path(os.path.expanduser(os.environ.get("HF_LEROBOT_HOME", f"{HF_HOME}/lerobot")))
+    return user_path(os.environ.get("HF_LEROBOT_HOME", f"{HF_HOME}/lerobot"))
 
 
 def local_root(config: DatasetConfig) -> Path:
@@ -54,7 +54,7 @@ def local_root(config: DatasetConfig) -> Path:
             "drop it, or drop --dataset.root"
         )
     if config.root:
-        return Path(os.path.expanduser(config.root)).absolute()
+        return user_path(config.root).absolute()
     _require_repo_id(config.repo_id)
     return lerobot_home() / config.repo_id
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from importlib import resources
-from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
+from egovcp.files import user_path
 from egovcp.robot.stance import StanceController
 from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import WalkingController
@@ -80,7 +80,7 @@ def load_walk_policy(which: str) -> WalkPolicy:
         with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
             return WalkPolicy.load(path)
     if is_controller_file(which):
-        return WalkPolicy.load(Path(os.path.expanduser(which)))
+        return WalkPolicy.load(user_path(which))
     raise UsageError(f"no trained network {which!r}; expected walk or PATH.safetensors")
 
 

@@ -57,6 +57,16 @@ class Hold(EnvPolicy):
         return np.zeros((env.num_envs, env.robot.action_dim))
 
 
+def require_ordered_steps(step_ticks: tuple[int, int]) -> tuple[int, int]:
+    """The interval of `RandomWalk`; raises `UsageError` unless the first is at most the second."""
+    shortest, longest = step_ticks
+    if shortest > longest:
+        raise UsageError(
+            f"--step_ticks={[shortest, longest]}: expected 1 <= shortest <= longest, planner ticks"
+        )
+    return shortest, longest
+
+
 class RandomWalk(EnvPolicy):
     """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^A.
 

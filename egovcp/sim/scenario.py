@@ -20,6 +20,15 @@ STUDIES: Final = 4_000_000_000  # of egovcp-experiment
 CHECK_SEED: Final = 6_000_000_000  # for `check_task`
 
 
+def require_training_seed(seed: int) -> None:
+    """Raise `UsageError` if the scenarios of ``seed`` are for evaluation."""
+    if seed >= HELD_OUT:
+        raise UsageError(
+            f"--seed={seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios beyond are "
+            "for evaluation"
+        )
+
+
 @dataclass(frozen=True)
 class Scenario:
     """Identifies one episode. Equal scenarios give equal episodes, bit for bit.

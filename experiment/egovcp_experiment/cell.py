@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
-from egovcp.files import sha256
+from egovcp.files import sha256, user_path
 from egovcp.manifest import MANIFEST, SEAL, read_manifest
 from egovcp.reactive import ReactiveNetwork
 
@@ -128,7 +127,7 @@ def read_json(path: Path) -> Any:
 
 def external_digest(path: str) -> str:
     """SHA-256 of an artifact, dataset or file; of a Hub repository only of its name."""
-    folder = Path(os.path.expanduser(path))
+    folder = user_path(path)
     if (folder / MANIFEST).is_file():
         return _artifact_digest(folder)
     if (folder / HASHES_PATH).is_file():

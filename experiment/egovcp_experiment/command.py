@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Final
 
 import draccus
@@ -15,6 +13,7 @@ from egovcp.artifact import load_artifact
 from egovcp.cli import given_options
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError
+from egovcp.files import user_path
 from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.subcommands import CommandGroup, Subcommand
@@ -56,7 +55,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
     prog, name = argv[:2]
     experiment = EXPERIMENTS[name]
     cells = experiment.cells(config)
-    store = CellStore(Path(os.path.expanduser(config.output_dir)))
+    store = CellStore(user_path(config.output_dir))
     with store.locked():
         scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records

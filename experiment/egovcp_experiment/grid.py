@@ -9,14 +9,13 @@ references-TASK            the same with constant, which needs an expensive sear
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artifact import policy_folder, shipped_policies
 from egovcp.data.schema import INFO_PATH
+from egovcp.files import user_path
 from egovcp_experiment.cell import (
     ARTIFACT,
     COLLECT,
@@ -83,7 +82,7 @@ class Grid:
 
     def given_size(self, task: str) -> tuple[int, int]:
         """Episodes and transitions of the dataset in `DataConfig.roots`."""
-        info = read_json(Path(os.path.expanduser(self.config.data.roots[task])) / INFO_PATH)
+        info = read_json(user_path(self.config.data.roots[task]) / INFO_PATH)
         return info["total_episodes"], info["total_frames"]
 
     def data(self, task: str) -> CellOutput | ExternalPath:

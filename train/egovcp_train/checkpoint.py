@@ -24,7 +24,14 @@ from egovcp.cli import given_options
 from egovcp.data import ReturnConfig
 from egovcp.data.dataset_files import sync, sync_tree
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.files import UnsafeFileError, open_regular, read_text, removed_on_error, sha256
+from egovcp.files import (
+    UnsafeFileError,
+    open_regular,
+    read_text,
+    removed_on_error,
+    sha256,
+    user_path,
+)
 from egovcp.flags import read_config
 from egovcp.model import WorldModel
 from egovcp.model.weights import MAX_WEIGHT_BYTES
@@ -61,7 +68,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
             f"--resume uses the options stored in --output_dir, and "
             f"--config_path={given['config_path']} gives others; drop it, and give changes as flags"
         )
-    saved = Path(os.path.expanduser(given.get("output_dir", ""))) / CONFIG_FILE
+    saved = user_path(given.get("output_dir", "")) / CONFIG_FILE
     if not os.path.lexists(saved):
         return {}
     try:
@@ -97,7 +104,7 @@ def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Pat
         UsageError: the folder exists and is not empty.
         EnvironmentFailure: it is not writable.
     """
-    output = Path(os.path.expanduser(output_dir))
+    output = user_path(output_dir)
     if resume:
         with _open_training_state(output):  # loaded later
             return output

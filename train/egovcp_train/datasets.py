@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +32,7 @@ from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root, locate
 from egovcp.dataset_options import DatasetConfig, SelectedDatasetConfig
 from egovcp.errors import DataError, UsageError
+from egovcp.files import user_path
 from egovcp.hardware import available_bytes, require_memory
 from egovcp.model import Batch, WorldModel
 from egovcp_train.checkpoint import CONFIG_FILE
@@ -132,7 +132,7 @@ def convert_if_needed(config: TrainConfig) -> TrainConfig:
     """
     if not config.features:
         return config
-    root = Path(os.path.expanduser(config.output_dir)).absolute() / "dataset"
+    root = user_path(config.output_dir).absolute() / "dataset"
     source = locate(config.dataset, config.loading.network)
     convert_dataset(source, config.features, root, config.dataset.episodes)
     dataset = SelectedDatasetConfig(repo_id=config.dataset.repo_id, root=str(root))

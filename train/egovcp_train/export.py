@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -14,10 +13,17 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from egovcp.artifact import CONFIG, WEIGHTS, Artifact, load_artifact, write_artifact
+from egovcp.artifact import (
+    CONFIG,
+    WEIGHTS,
+    Artifact,
+    load_artifact,
+    replaced_folder,
+    write_artifact,
+)
 from egovcp.cli import run_command
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.files import removed_on_error, write_text
+from egovcp.files import write_text
 from egovcp.manifest import FORMAT_KEYS, PROCESSORS
 from egovcp.policy_options import PolicyOptions
 from egovcp.terminal import echo
@@ -59,11 +65,8 @@ def export(config: ExportConfig) -> None:
     # Absolute: a relative path could be the name of a shipped policy, or have no last component.
     output = prepare_output(config.output_dir, resume=False, resumable=False).absolute()
     artifact = load_artifact(config.policy.path, config.policy.revision)
-    with removed_on_error(output.with_name(output.name + ".partial")) as work:
-        shutil.rmtree(work, ignore_errors=True)
-        work.mkdir(parents=True)
+    with replaced_folder(output) as work:
         write_half_precision(artifact, work)
-        os.replace(work, output)
     write_text(output / CARD, card_text(load_artifact(str(output)), ""))
     echo(f"{output / WEIGHTS}: {(output / WEIGHTS).stat().st_size / 1e6:.1f} MB")
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.resources import files
-from pathlib import Path
 from typing import Any, Final
 
 from huggingface_hub import DatasetCard, DatasetCardData
@@ -15,7 +13,7 @@ from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.data.provenance import source_provenances
 from egovcp.errors import UsageError
-from egovcp.files import write_text
+from egovcp.files import user_path, write_text
 from egovcp.help_text import field_docs
 from egovcp.hub import is_repo_id
 from egovcp.outputs import output_file
@@ -57,7 +55,7 @@ def run_card(config: CardConfig) -> None:
         raise UsageError(
             f"{reader.root} is the Hub's cache, which is not changed; give a file: --output=FILE"
         )
-    output = Path(os.path.expanduser(config.output)) if config.output else reader.root / CARD
+    output = user_path(config.output) if config.output else reader.root / CARD
     statistics = compute_statistics(reader, ReturnConfig())
     paths = draw_figures(statistics, ReturnConfig(), output.parent / config.assets)
     plots = {path.stem: f"{config.assets}/{path.name}" for path in paths}

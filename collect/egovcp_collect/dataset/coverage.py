@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +15,7 @@ from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError, UsageError
+from egovcp.files import user_path
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
@@ -115,7 +114,7 @@ def run_coverage(config: CoverageConfig) -> None:
         echo(f"  {'ok  ' if check.passed else 'warn'}  {check.task}: {check.text}")
     echo(f"  {summary(checks)}")
     if config.output_dir:
-        folder = Path(os.path.expanduser(config.output_dir))
+        folder = user_path(config.output_dir)
         for path in draw_figures(statistics, config.returns, folder):
             echo(f"wrote {path}")
     assessment = {

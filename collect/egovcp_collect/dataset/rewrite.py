@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -34,6 +33,7 @@ from egovcp.data.reader import mistimed
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
+from egovcp.files import user_path
 from egovcp.outputs import output_file, write_report
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo, echo_lines, one_line
@@ -182,7 +182,7 @@ def run_repair(config: RepairConfig) -> None:
     require_folder(root)
     output = new_folder(config.output_dir, [root])
     given = config.records.split(",") if isinstance(config.records, str) else config.records
-    originals = [Path(os.path.expanduser(name)).absolute() for name in given if name]
+    originals = [user_path(name).absolute() for name in given if name]
     if not is_own(root) and not originals:
         _repair_other(config, root, output)
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,7 @@ from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate, locate_on_demand
 from egovcp.errors import UsageError
-from egovcp.files import removed_on_error
+from egovcp.files import removed_on_error, user_path
 from egovcp.log.tick import Sink
 from egovcp.outputs import output_file, require_writable
 from egovcp.packages import require_packages
@@ -71,7 +70,7 @@ def run_viz(config: VizConfig) -> None:
     name = source.root.name
     if source.commit:  # the folder of a downloaded dataset is named after its commit
         name = source.repo_id.partition("/")[2]
-    output = Path(os.path.expanduser(config.output or f"{name}-episode-{config.episode}.rrd"))
+    output = user_path(config.output or f"{name}-episode-{config.episode}.rrd")
     require_writable(output.parent)
     if isinstance(reader, DatasetReader):
         write_recording(reader, config.episode, output)

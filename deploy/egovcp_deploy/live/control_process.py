@@ -47,14 +47,11 @@ _DAMPING_PERIOD_NS: Final = 5_000_000
 _SWITCH_S: Final = 0.001  # longest wait of the loop for a receiving thread
 
 
-def control_process(
-    options: RobotOptions, address: str, parent: int, commanded: c_bool | None = None
-) -> None:
+def control_process(options: RobotOptions, address: str, parent: int, commanded: c_bool) -> None:
     """Main function of the process; returns on a quit command, on SIGTERM, SIGHUP or SIGQUIT, or
     2 s after the planner's process ``parent`` has ended, once the motors are damped. ``address`` is
     that of the link between them; ``commanded``, in shared memory, tells whether motor commands are
     sent (see `ControlLoop.tick`)."""
-    commanded = c_bool(False) if commanded is None else commanded
     os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
     with stop_on_signal(signals=_STOP_SIGNALS, interrupt=False) as stopping:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop
 from egovcp.files import write_json
-from egovcp.hardware import available_cores
 from egovcp.log.tick import RunInfo, Sink
 from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
@@ -31,7 +28,7 @@ from egovcp_deploy.live.planner_loop import (
 )
 from egovcp_deploy.live.processes import running_control, stop_control
 from egovcp_deploy.options import make_output_dir
-from egovcp_deploy.pilot.planner import PlannerRunner, backend_of
+from egovcp_deploy.pilot.planner import PlannerRunner, backend_of, leave_core
 from egovcp_deploy.recording import (
     missing_ticks,
     open_viewer,
@@ -50,10 +47,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
     artifact.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
     stays = config.operator.type == "keyboard" or not config.operator.duration
-    if "OMP_NUM_THREADS" not in os.environ:
-        # The control process and the logs need a core: planning threads that wait for one that was
-        # preempted are slower than fewer threads.
-        torch.set_num_threads(max(1, available_cores() - 1))
+    leave_core()
     policy = artifact.make_policy(1, config.seed)
     runner = PlannerRunner(policy, config.imagine)
     runner.warm_up()

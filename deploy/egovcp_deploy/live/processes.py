@@ -117,7 +117,7 @@ class DampingWatchdog:
         self,
         process: BaseProcess,
         body: BridgeRobot,
-        commanded: Callable[[], bool] = lambda: True,
+        commanded: Callable[[], bool],
     ) -> None:
         self._process, self._body, self._commanded = process, body, commanded
         self.expected: Callable[[], bool] = lambda: False  # whether a quit command was sent

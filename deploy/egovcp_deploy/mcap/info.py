@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 from collections import Counter
@@ -14,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.errors import UsageError
+from egovcp.files import user_path
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.log.tick import MODES
@@ -151,7 +151,7 @@ def run(config: RecordingInfoConfig) -> None:
     """Print the summary; then raise `DataError` if the recording is damaged."""
     if not config.file:
         raise UsageError("no recording given; usage: egovcp-mcap info FILE")
-    report, reader = summarise(Path(os.path.expanduser(config.file)))
+    report, reader = summarise(user_path(config.file))
     if config.json == STDOUT:
         echo(json.dumps(report, indent=2))
     else:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from egovcp.errors import UsageError
-from egovcp.files import removed_on_error
+from egovcp.files import removed_on_error, user_path
 from egovcp.log.mcap import McapFile
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.outputs import output_file
@@ -30,7 +29,7 @@ def run(config: RecoverConfig) -> None:
     recording of ours, `EnvironmentFailure` if the output exists or the disk is full."""
     if not config.file or not config.output:
         raise UsageError("two files are needed; usage: egovcp-mcap recover TRUNCATED OUT")
-    source, output = (Path(os.path.expanduser(file)) for file in (config.file, config.output))
+    source, output = (user_path(file) for file in (config.file, config.output))
     ticks, reader = recover(source, output)
     state = "is truncated: its end is missing" if reader.torn else "was already complete"
     if reader.damaged:

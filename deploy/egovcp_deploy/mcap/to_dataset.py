@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import shlex
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError
+from egovcp.files import user_path
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
 from egovcp.packages import DATA_MODULES, require_packages
@@ -68,7 +68,7 @@ def run(config: ToDatasetConfig) -> None:
     from egovcp.data.destination import require_new, resolve_root
     from egovcp.data.source import local_root
 
-    paths = [Path(os.path.expanduser(file)) for file in config.files]
+    paths = [user_path(file) for file in config.files]
     root = resolve_root(local_root(config.dataset))
     require_new(root)
     if config.mapping:
@@ -93,7 +93,7 @@ def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) 
     from egovcp.data.writer import new_dataset
     from egovcp_deploy.mcap.topics import TopicMapping, TopicRecording
 
-    mapping = TopicMapping.read(Path(os.path.expanduser(config.mapping)))
+    mapping = TopicMapping.read(user_path(config.mapping))
     recordings = [(r, *r.gap()) for r in (TopicRecording(path, mapping) for path in paths)]
     for recording, kept, gap in recordings:
         if gap and (config.gaps == "refuse" or kept == 0):

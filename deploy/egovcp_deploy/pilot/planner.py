@@ -8,6 +8,7 @@ it in lock-step with simulated time; `live.link.RemotePlanner` reaches it in ano
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from egovcp.hardware import available_cores
 from egovcp.log.tick import Candidates, Hand, MotorReadings, ValueMap
 from egovcp.plan import (
     PlannerConfig,
@@ -68,6 +70,16 @@ class RolloutPolicy(Protocol):
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Advance by a tick with the actions (E, 7) that were sent."""
+
+
+def leave_core() -> None:
+    """Plan with one thread less than there are cores, unless the user limits the threads.
+
+    The control process and the logs need a core: planning threads that wait for one that was
+    preempted are slower than fewer threads.
+    """
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(max(1, available_cores() - 1))
 
 
 def backend_of(policy: RolloutPolicy) -> str:

@@ -36,7 +36,7 @@ from egovcp.model import Carry, WorldModel
 from egovcp.plan.search import random_walk
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.policies import RandomWalk
+from egovcp.sim.policies import RandomWalk, require_ordered_steps
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, REWARD_TERMS
 from egovcp.terminal import echo
@@ -64,12 +64,7 @@ class ResidualsConfig(study.SimStudyConfig):
     def check(self) -> None:
         """See `StudyConfig.check`."""
         super().check()
-        shortest, longest = self.step_ticks
-        if shortest > longest:
-            raise UsageError(
-                f"--step_ticks={[shortest, longest]}: expected 1 <= shortest <= longest, planner "
-                "ticks"
-            )
+        require_ordered_steps(self.step_ticks)
 
     def load(self) -> Artifact:
         """As `SimStudyConfig.load`; warns if Q was not trained on returns."""

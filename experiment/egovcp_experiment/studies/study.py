@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
-from egovcp.files import write_json
+from egovcp.files import user_path, write_json
 from egovcp.model import Carry
 from egovcp.outputs import require_writable
 from egovcp.plan import PolicyStep
@@ -49,7 +48,7 @@ class StudyConfig:
     @property
     def folder(self) -> Path:
         """The folder for the result."""
-        return Path(os.path.expanduser(self.output_dir))
+        return user_path(self.output_dir)
 
     def check(self) -> None:
         """Check the options before the work; `make_main` calls it.

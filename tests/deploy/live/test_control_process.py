@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from ctypes import c_bool
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,6 +41,7 @@ from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.command import EpisodeSequencer, FakeG1Config
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from tests.support.lockstep import LockstepClock
+from tests.support.pipes import full_pipe
 from tests.support.robots.fake_g1 import FakeG1Thread, bridge_config
 from tests.support.robots.sim_low_level import SimLowLevelRobot
 
@@ -138,12 +139,7 @@ def test_a_stop_precedes_a_hold_which_precedes_other_requests(
 def test_a_blocked_terminal_does_not_stop_the_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    with suppress(BlockingIOError):
-        while True:
-            os.write(writer, bytes(1 << 16))
-    os.set_blocking(writer, True)
+    reader, writer = full_pipe()
     hardware = SimpleNamespace(body=SimpleNamespace(read=lambda: None), camera=None, link=None)
     options, parent = RobotOptions(controller="stance"), 0  # has ended
     ticks, stopping, enough = list[int](), list[int](), threading.Event()

@@ -25,6 +25,7 @@ from egovcp_deploy.live import drive as drive_module
 from egovcp_deploy.live.display import Display
 from egovcp_deploy.live.drive import drive
 from egovcp_deploy.live.planner_loop import LiveSummary
+from tests.support.pipes import full_pipe
 from tests.support.sinks import MemorySink
 
 
@@ -110,12 +111,7 @@ def test_a_failure_says_that_the_robot_was_held_only_if_it_was(
 
 
 def test_a_blocked_terminal_does_not_block_the_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    with suppress(BlockingIOError):
-        while True:
-            os.write(writer, bytes(1 << 16))
-    os.set_blocking(writer, True)
+    reader, writer = full_pipe()
     depth, state = np.zeros((48, 64), np.uint16), np.zeros(STATE_DIM, np.float32)
     action = np.zeros(ACTION_DIM)
     tick = Tick(0, 0, depth, state, action, action, mode="run", events=("x" * 1000,) * 100)

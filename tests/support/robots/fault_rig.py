@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from ctypes import c_bool
 from dataclasses import dataclass, field
 from multiprocessing.process import BaseProcess
 from typing import Final
@@ -126,7 +127,7 @@ def constant_plan(report: ObservationMessage) -> list[list[bytes]]:
 
 
 def _run_control_process(options: RobotOptions, address: str) -> None:
-    control_process(options, address, os.getppid())  # the fork server
+    control_process(options, address, os.getppid(), c_bool())  # the fork server
 
 
 class FaultRig:
@@ -254,7 +255,7 @@ class FaultRig:
         with raised_priority(RECEIVER_PRIORITY):  # inherited by the fork server
             self.process.start()
         stack.callback(self._end_process)
-        guard = DampingWatchdog(self.process, spare)
+        guard = DampingWatchdog(self.process, spare, lambda: True)
         guard.expected = lambda: self._ending
         stack.callback(guard.join_if_ended)
         ending = threading.Event()

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -16,7 +14,7 @@ from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.eval_scores import wilson
-from egovcp.files import write_json
+from egovcp.files import user_path, write_json
 from egovcp.hardware import available_cores
 from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages
@@ -92,7 +90,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     if config.videos:
         require_packages("egovcp-train", "--videos", "matplotlib", "rerun")
     controller = make_controller(config.controller)
-    output = Path(os.path.expanduser(config.output_dir))
+    output = user_path(config.output_dir)
     require_writable(output)
     figures: dict[str, dict[str, Any]] = {}
     complete = False
@@ -131,7 +129,7 @@ def _play_all(
 
     recorders: dict[str, Any] = {}
     if config.videos:
-        folder = Path(os.path.expanduser(config.output_dir))
+        folder = user_path(config.output_dir)
         folder.mkdir(parents=True, exist_ok=True)
         recorders = {skill.name: SkillRecorder(skill.name, folder) for skill in skills}
     threads = config.threads or available_cores()

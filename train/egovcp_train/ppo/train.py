@@ -16,13 +16,12 @@ import torch
 
 from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
 from egovcp.cli import run_command
-from egovcp.errors import UsageError
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.reactive import ReactiveConfig
 from egovcp.robot.controllers import absolute_controller, make_controller
 from egovcp.sim.config import EnvConfig, require_memory_for_robots
-from egovcp.sim.scenario import HELD_OUT
+from egovcp.sim.scenario import require_training_seed
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
 from egovcp.spec import GAMMA
 from egovcp_train.checkpoint import load_training_state, prepare_output, resumed_options
@@ -78,11 +77,7 @@ class PpoTrainConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
         select_tasks(self.task, training=True)
-        if self.seed >= HELD_OUT:
-            raise UsageError(
-                f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
-                "beyond are for evaluation"
-            )
+        require_training_seed(self.seed)
 
     @property
     def tasks(self) -> tuple[str, ...]:
