@@ -174,7 +174,7 @@ def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
 
 @contextmanager
 def replaced_folder(path: Path) -> Iterator[Path]:
-    """A new folder that replaces ``path`` at the end of the block; the old one stays on an error."""
+    """A new folder that replaces ``path`` at the end of the block; on an error ``path`` stays."""
     old = path.with_name(path.name + ".old")
     with removed_on_error(path.with_name(path.name + ".partial")) as new:
         shutil.rmtree(new, ignore_errors=True)
