@@ -96,7 +96,11 @@ class RobotSpec:
                 yield f"{what} are {len(names)} names, expected 2 to {most}, all different"
         size = self.action_dim
         if not _is_ascending(self.action_box, size):
-            yield f"its action_box is not low < neutral < high for each of {size} actions"
+            yield (
+                f"its action_box is not low < neutral < high for each of {size} actions (found "
+                f"low {self.action_box.low}, neutral {self.action_box.neutral}, high "
+                f"{self.action_box.high})"
+            )
         if self.mirror is None:
             return
         for what, source, sign, size in (

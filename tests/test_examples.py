@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from egovcp.checks import ConformanceError, check_robot, check_task
-from egovcp.errors import UsageError
+from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.log.mcap_reader import read_recording
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
@@ -81,6 +81,45 @@ def test_another_robot_conforms(monkeypatch: pytest.MonkeyPatch) -> None:
         check_robot(lagging)
     with pytest.raises(UsageError, match=r"expected package\.module:Class"):
         check_robot("arm_robot:Nothing")
+    with pytest.raises(EnvironmentFailure, match=r"no camera 'front' \(found: depth\)"):
+        type("Blind", (arm,), {"camera": "front"})(arm.build().compile())
+
+
+@pytest.mark.parametrize(
+    ("body", "error", "message"),
+    [
+        ("spec = wrong", ConformanceError, r"robot Arm: tip\.x differs"),
+        ("state = broken", EnvironmentFailure, "OSError in other_task.py, line .*: encoder"),
+    ],
+)
+def test_a_check_of_a_task_checks_its_robot(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    body: str,
+    error: type[Exception],
+    message: str,
+) -> None:
+    source = f"""
+from dataclasses import replace
+from arm_task import PlanarArm, ReachTask
+
+signs = (*[-1.0] * 9, -1.0, -1.0, 1.0)
+wrong = replace(PlanarArm.spec, mirror=replace(PlanarArm.spec.mirror, state_sign=signs))
+
+def broken(self):
+    raise OSError("encoder offline")
+
+class Arm(PlanarArm):
+    {body}
+
+class OtherTask(ReachTask):
+    name = "other_reach"
+    robot_class = Arm
+"""
+    monkeypatch.syspath_prepend(str(_ARM))
+    install(tmp_path, "other", source, "other_reach = other_task:OtherTask", monkeypatch)
+    with pytest.raises(error, match=message):
+        check_task("other_reach")
 
 
 def test_constant_actions_of_another_robot_exclude_the_neutral_one(

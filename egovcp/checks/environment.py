@@ -36,7 +36,8 @@ def check_env(env: BaseVectorEnv, scenarios: Sequence[Scenario], ticks: int = 20
         for name in a:
             if not np.array_equal(a[name], b[name]):
                 raise ConformanceError(
-                    f"environment, tick {t}: {name} differs between two runs with the same actions"
+                    f"environment, tick {t}: {name} differs between two runs with the same "
+                    "actions; draw random numbers from the scenario only"
                 )
 
 

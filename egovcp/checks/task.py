@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.checks.environment import check_env
+from egovcp.checks.robot import check_robot
 from egovcp.errors import ConformanceError
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def check_task(
 
     Seeds must reproduce episodes bit for bit, also after other episodes and in another row. States
     and rewards must be finite, and reward terms at most ``MAX_REWARD`` in size. An episode ends by
-    a fall or the time limit, never by success. `check_env` checks the first 10 ticks only.
+    a fall or the time limit, never by success. `check_env` checks the first 10 ticks only, and
+    `check_robot` the robot, if it is not the G1.
 
     Args:
         task: name of an installed task, or ``package.module:Class``.
@@ -54,17 +56,24 @@ def check_task(
         UsageError: the task is unknown.
         EnvironmentFailure: the task is defective: its scene does not compile, or a reward is NaN.
     """
+    from egovcp.sim.base_env import naming_plugins
     from egovcp.sim.config import evaluation_config
     from egovcp.sim.policies import Hold, Oracle, RandomWalk
     from egovcp.sim.robot_env import make_env
     from egovcp.sim.scenario import CHECK_SEED, Scenario
     from egovcp.sim.tasks.registry import find_task, register_task
+    from egovcp.sim.tasks.robot_task import RobotTask
 
     name = register_task(task) if ":" in task else task
     kind = find_task(name)
+    if issubclass(kind, RobotTask):
+        naming_plugins(check_robot)(kind.robot_class)
     scenarios = [Scenario(name, CHECK_SEED + seed, i) for i in range(episodes)]
     with closing(make_env(config or evaluation_config(), episodes, [name])) as env:
-        check_env(env, scenarios, _ENV_TICKS)
+        try:
+            check_env(env, scenarios, _ENV_TICKS)
+        except ConformanceError as error:
+            raise ConformanceError(f"task {name}: {error}") from error
         started = time.perf_counter()
         played = {"random": _play(env, RandomWalk(), scenarios)}
         steps = sum(len(episode.arrays["reward"]) for episode in played["random"])
@@ -146,14 +155,14 @@ def _check(instance: Any, row: int, result: Any) -> None:
     for name, value in instance.parameters.items():
         require(np.isfinite(value), f"its parameter {name} is {value}")
     for name, values in result.reward_terms.items():
-        found = f"reward term {name} is {values[row]}, expected at most {MAX_REWARD} in size"
-        require(abs(values[row]) <= MAX_REWARD, found)
+        message = f"reward term {name} is {values[row]}, expected at most {MAX_REWARD} in size"
+        require(abs(values[row]) <= MAX_REWARD, message)
     if result.terminated[row]:
-        upright = f"the episode ended although the robot stands (success: {task.achieved})"
-        require(_has_fallen(task), upright)
+        message = f"the episode ended although the robot stands (success: {task.achieved})"
+        require(_has_fallen(task), message)
     if result.truncated[row] and type(task).for_training:  # a sequence ends after its last part
-        early = f"the episode ended after {instance.tick} of {task.ticks_limit} ticks"
-        require(instance.tick == task.ticks_limit, early)
+        message = f"the episode ended after {instance.tick} of {task.ticks_limit} ticks"
+        require(instance.tick == task.ticks_limit, message)
     place = task.object_w
     numbers = np.shape(place) == (3,) and (np.isfinite(place).all() or np.isnan(place).all())
     require(numbers, f"the position of its object is {place}")

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import UsageError
+from egovcp.errors import EgovcpError, UsageError
 from egovcp.robot_spec import RobotSpec
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks.registry import find_task
+from egovcp.sim.tasks.registry import find_task, plugin_failure
 from egovcp.spec import ACTION_RATE_LIMIT, OBJECT_DIM
 
 if TYPE_CHECKING:
@@ -45,6 +46,22 @@ class StepResult:
     sent_action: Array  # (B, A) after the rate limit and the box
     parts: tuple[dict[str, bool], ...]
     """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
+
+
+def naming_plugins[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate ``function``: an exception that the code of a plugin raises becomes an
+    `EnvironmentFailure` that names it and says what to do."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except EgovcpError:
+            raise
+        except Exception as error:
+            raise plugin_failure(error) or error from error
+
+    return call
 
 
 def one_robot(tasks: Iterable[str]) -> RobotSpec:
@@ -180,6 +197,7 @@ class BaseVectorEnv(ABC):
         """Whether ``position`` (3,), m, base frame, is within the range of the depth camera, and of
         the G1 also in front of the pelvis; the field of view is ignored."""
 
+    @naming_plugins
     def known_objects(self) -> NDArray[np.float32]:
         """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
 
@@ -219,6 +237,7 @@ class BaseVectorEnv(ABC):
         """(B,) rows whose episode is over."""
         return np.array([instance.done for instance in self.instances])
 
+    @naming_plugins
     def reset(self, scenarios: Sequence[Scenario]) -> Observation:
         """Start an episode in every row."""
         if len(scenarios) != self.num_envs:
@@ -229,6 +248,7 @@ class BaseVectorEnv(ABC):
         self.instances = [self._instance(scenario) for scenario in scenarios]
         return self._begin(None)
 
+    @naming_plugins
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
         """Start a new episode in some rows, the others stay as they are."""
         if not self.instances:

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController, absolute_controller, make_controller
 from egovcp.robot_spec import G1
-from egovcp.sim.base_env import BaseVectorEnv, Observation, StepResult, one_robot
+from egovcp.sim.base_env import (
+    BaseVectorEnv,
+    Observation,
+    StepResult,
+    naming_plugins,
+    one_robot,
+)
 from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.scenario import Scenario
@@ -113,6 +119,7 @@ class VectorEnv(BaseVectorEnv):
         self.controller.reset(self._controller_state, rows)
         return observation
 
+    @naming_plugins
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, 7) per row and let a planner tick (40 ms) pass."""
         live = ~self.done

@@ -57,7 +57,13 @@ class MujocoRobot(ABC):
         self.model, self.data = model, mujoco.MjData(model)
         self.rng = np.random.default_rng(0)
         """Source of sensor noise in this episode."""
-        self._camera = int(model.camera(self.camera).id)
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        if self.camera not in cameras:
+            raise EnvironmentFailure(
+                f"robot {type(self).__name__}: its model has no camera {self.camera!r} (found: "
+                f"{', '.join(cameras) or 'none'}); name the depth camera so in build"
+            )
+        self._camera = cameras.index(self.camera)
         rows, columns = self.spec.depth
         focal = focal_length(math.radians(float(model.cam_fovy[self._camera])), rows)
         forward, left, up = pixel_rays(focal, rows, columns).T

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.base_env import BaseVectorEnv
+from egovcp.sim.base_env import BaseVectorEnv, naming_plugins
 from egovcp.sim.scenario import Scenario
+from egovcp.sim.tasks.base_task import BaseTask
 from egovcp.sim.tasks.registry import find_task
 from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
 
@@ -159,4 +160,12 @@ class Oracle(EnvPolicy):
                 raise UsageError(f"task {task} has no oracle; choose another controller")
 
     def act(self, env: BaseVectorEnv) -> Array:
-        return np.array([instance.task.oracle() for instance in env.instances])
+        return np.array([_oracle_action(instance.task) for instance in env.instances])
+
+
+@naming_plugins
+def _oracle_action(task: BaseTask) -> Array:
+    action = np.asarray(task.oracle(), np.float64)
+    if action.shape != (task.robot_spec().action_dim,) or not np.isfinite(action).all():
+        raise task.error(f"its oracle returns {action.tolist()}, expected the numbers of an action")
+    return action

@@ -16,6 +16,7 @@ from egovcp.sim.base_env import (
     BaseVectorEnv,
     Observation,
     StepResult,
+    naming_plugins,
     one_robot,
     require_class,
 )
@@ -128,6 +129,7 @@ class RobotEnv(BaseVectorEnv):
     def _instance(self, scenario: Scenario) -> RobotInstance:
         return RobotInstance(self.config, scenario)
 
+    @naming_plugins
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, A) per row and let a planner tick pass."""
         self._send(action, ~self.done)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from egovcp.sim.mujoco_robot import MujocoRobot
     from egovcp.sim.scene import HANDS, HEAD, LEG, PARTS, TORSO, Contact
     from egovcp.sim.tasks.base import Array, Task
+    from egovcp.sim.tasks.base_task import BaseTask
     from egovcp.sim.tasks.robot_task import RobotTask
     from egovcp.spec import ActionBox, Solid
 
@@ -25,6 +26,7 @@ __all__ = [
     "TORSO",
     "ActionBox",
     "Array",
+    "BaseTask",
     "Contact",
     "EpisodeConfig",
     "Mirror",
@@ -48,6 +50,7 @@ _MODULES = {
     **dict.fromkeys(("Array", "Task"), "egovcp.sim.tasks.base"),
     **dict.fromkeys(("Mirror", "RobotSpec"), "egovcp.robot_spec"),
     **dict.fromkeys(("ActionBox", "Solid"), "egovcp.spec"),
+    "BaseTask": "egovcp.sim.tasks.base_task",
     "MujocoRobot": "egovcp.sim.mujoco_robot",
     "RobotTask": "egovcp.sim.tasks.robot_task",
 }
@@ -57,3 +60,7 @@ def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

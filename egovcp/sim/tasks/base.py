@@ -102,7 +102,7 @@ class Task(BaseTask):
     @property
     def object_b(self) -> Array:
         """(3,) position of the object, m, pelvis heading frame."""
-        return self.to_heading_frame(self.object_w - self.robot.data.qpos[:3])
+        return self.to_heading_frame(self.require_position() - self.robot.data.qpos[:3])
 
     @staticmethod
     def action_of(

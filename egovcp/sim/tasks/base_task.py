@@ -133,6 +133,17 @@ class BaseTask(ABC):
     def park(self) -> None:  # noqa: B027 - optional
         """Move the objects out of sight and reach; see `in_sequence`."""
 
+    def require_position(self) -> Array:
+        """`object_w`.
+
+        Raises:
+            EnvironmentFailure: it is not an array (3,).
+        """
+        position = np.asarray(self.object_w, np.float64)
+        if position.shape != (3,):
+            raise self.error(f"its object_w has shape {position.shape}, expected (3,)")
+        return position
+
     @property
     def finished(self) -> bool:
         """Whether the object no longer matters, such as a ball on the floor."""
@@ -149,8 +160,11 @@ class BaseTask(ABC):
         They are `parameters` of the episode. Further calls continue the random stream.
         """
         rng = self._geometry_rng
-        ranges = ((name, getattr(self.config, f"{name}_range")) for name in names)
-        self.parameters |= {name: float(rng.uniform(*limits)) for name, limits in ranges}
+        for name in names:
+            limits = getattr(self.config, f"{name}_range", None)
+            if limits is None:
+                raise self.error(f"sample({name!r}), but its config has no {name}_range")
+            self.parameters[name] = float(rng.uniform(*limits))
         return self.parameters
 
     def once(self, term: str, due: bool) -> bool:
@@ -260,9 +274,10 @@ class BaseTask(ABC):
     @classmethod
     def error(cls, problem: str) -> EnvironmentFailure:
         """The error of a defective task; the message names the class and what to do."""
+        reference = f"{cls.__module__}:{cls.__qualname__}"
         return EnvironmentFailure(
-            f"task {cls.name} ({cls.__module__}:{cls.__qualname__}): {problem}; repair the class, "
-            f"then run egovcp-task check {cls.name}"
+            f"task {cls.name} ({reference}): {problem}; repair the class, then run egovcp-task "
+            f"check {reference}"
         )
 
     def _solid(self, geom: int) -> Solid:

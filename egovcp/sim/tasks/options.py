@@ -8,7 +8,7 @@ from typing import Final
 from egovcp.bounds import bounded
 
 Range = tuple[float, float]
-#: Longest episode, planner ticks of 40 ms.
+#: Longest episode, planner ticks.
 MAX_TICKS: Final = 10_000
 #: Greatest coefficient of a reward term; larger ones lose the others in float32.
 MAX_REWARD: Final = 1000
@@ -16,7 +16,7 @@ MAX_REWARD: Final = 1000
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """Length of an episode and the time of its event, in planner ticks of 40 ms."""
+    """Length of an episode and the time of its event, in planner ticks (G1: 40 ms)."""
 
     ticks: int = bounded(150, least=1, most=MAX_TICKS)
     """Time limit, planner ticks; reaching it truncates the episode."""

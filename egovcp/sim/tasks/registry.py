@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import re
 import sys
+import traceback
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -42,6 +43,8 @@ class TaskEntry:
     name: str
     origin: str
     """What provides it: ``egovcp 0.1.0``, or a reference."""
+    reference: str
+    """``module:Class``."""
     task: type[BaseTask] | None
     """None: it cannot be used because of `problem`."""
     problem: str = ""
@@ -49,10 +52,10 @@ class TaskEntry:
     @property
     def failure(self) -> str:
         """One line that names the plugin and what to do."""
-        return (
-            f"task {self.name!r} of {self.origin} cannot be used: {self.problem}; repair or "
-            "uninstall it"
-        )
+        installed = self.origin != self.reference
+        name = f"{self.name!r} of {self.origin}" if installed else self.reference
+        remedy = "repair or uninstall it" if installed else "repair the class"
+        return f"task {name} cannot be used: {self.problem}; {remedy}"
 
 
 _found: list[TaskEntry] | None = None
@@ -98,11 +101,12 @@ def _add(name: str, origin: str, reference: str) -> TaskEntry:
             raise ValueError(f"the class {reference} is named {task.name!r}; use one name")
         for other in _found:
             if other.name == task.name and other.task is not None:
-                raise ValueError(f"{other.origin} has a task of this name; rename it")
-        entry = TaskEntry(task.name, origin, task)
+                raise ValueError(f"its name, {task.name!r}, is that of a task of {other.origin}")
+        entry = TaskEntry(task.name, origin, reference, task)
     except Exception as error:  # noqa: BLE001 - whatever the import of a plugin raises
         kind = "" if isinstance(error, ValueError | EgovcpError) else f"{type(error).__name__}: "
-        entry = TaskEntry(name or reference, origin, None, kind + " ".join(str(error).split()))
+        problem = kind + " ".join(str(error).split())
+        entry = TaskEntry(name or reference, origin, reference, None, problem)
     _found.append(entry)
     return entry
 
@@ -129,6 +133,7 @@ def _check(task: type[BaseTask]) -> None:
 
 def _missing_of_robot(task: type[BaseTask]) -> list[str]:
     """What the robot of a `RobotTask` lacks."""
+    from egovcp.sim.mujoco_robot import MujocoRobot
     from egovcp.sim.tasks.robot_task import RobotTask
 
     if not issubclass(task, RobotTask):
@@ -138,6 +143,8 @@ def _missing_of_robot(task: type[BaseTask]) -> list[str]:
     robot = getattr(task, "robot_class", None)
     if robot is None:
         return ["robot_class"]
+    if not (inspect.isclass(robot) and issubclass(robot, MujocoRobot)):
+        raise ValueError(f"its robot_class is {robot!r}, expected a subclass of MujocoRobot")
     missing = [*sorted(robot.__abstractmethods__)]
     missing += [a for a in ("spec", "control_id") if not hasattr(robot, a)]
     return [f"robot_class.{name}" for name in missing]
@@ -171,7 +178,7 @@ def register_task(reference: str) -> str:
     if folder not in sys.path:
         sys.path.append(folder)
     for entry in task_entries():
-        if entry.origin == reference and entry.task is not None:
+        if entry.reference == reference and entry.task is not None:
             return entry.name
     entry = _add("", reference, reference)
     if entry.task is None:
@@ -181,6 +188,21 @@ def register_task(reference: str) -> str:
     known = filter(None, (os.environ.get(VARIABLE, ""), reference))
     os.environ[VARIABLE] = ",".join(known)
     return entry.name
+
+
+def plugin_failure(error: Exception) -> EnvironmentFailure | None:
+    """The failure of the task in whose code, or whose robot's, ``error`` was raised; None: in that
+    of no task but egovcp's own."""
+    modules: dict[str, type[BaseTask]] = {}
+    for task in (entry.task for entry in task_entries() if entry.task is not None):
+        for kind in (*task.__mro__, *getattr(task, "robot_class", task).__mro__):
+            modules.setdefault(kind.__module__, task)
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        module = frame.f_globals.get("__name__", "")
+        if module in modules and not module.startswith("egovcp."):
+            where = f"{os.path.basename(frame.f_code.co_filename)}, line {line}"
+            return modules[module].error(f"{type(error).__name__} in {where}: {error}")
+    return None
 
 
 def installed_task(name: str) -> type[BaseTask] | None:

@@ -99,5 +99,5 @@ class RobotTask(BaseTask):
         pose = self.robot.base_pose
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, pose[3:])
-        position: Array = (self.object_w - pose[:3]) @ rotation.reshape(3, 3)
+        position: Array = (self.require_position() - pose[:3]) @ rotation.reshape(3, 3)
         return position

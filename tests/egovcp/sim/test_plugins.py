@@ -85,6 +85,7 @@ def changed(
 def play(env: VectorEnv) -> None:
     env.reset([Scenario("post", 0, 0)])
     env.step(np.zeros((1, 7)))
+    env.known_objects()
 
 
 @pytest.mark.usefixtures("post")
@@ -206,6 +207,18 @@ def test_a_late_state_that_is_not_finite_is_named(
             "its scene does not compile: division by zero",
         ),
         ('name="post", mocap', 'name="pelvis", mocap', "its scene does not compile: .*pelvis"),
+        (
+            "place(self):",
+            "place(self):\n        1 / 0",
+            r"ZeroDivisionError in post_task\.py, line 3",
+        ),
+        (
+            '{"touch": 0.25}',
+            '{"touch": touched}',
+            r"NameError in .*: name 'touched' is not defined",
+        ),
+        ('sample("distance")', 'sample("size")', r"sample\('size'\), but .* has no size_range"),
+        ("pos[-1].copy()", "pos[-1][:2]", r"its object_w has shape \(2,\), expected \(3,\)"),
     ],
 )
 def test_a_defective_task_is_named_with_what_to_do(
@@ -236,7 +249,7 @@ def test_a_defective_task_is_named_with_what_to_do(
             'name = "post"',
             'name = "ball"',
             "ball = post_task:PostTask",
-            "egovcp .* has a task of this",
+            "its name, 'ball', is that of a task of egovcp ",
         ),
         ('name = "post"', 'name = "camera"', "camera = post_task:PostTask", "cannot be the name"),
         ('name = "post"', 'name = "pillar"', ENTRY, "is named 'pillar'; use one name"),
@@ -284,8 +297,27 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
     assert arguments == ["--task=ball,post", "--seed=1"]
     monkeypatch.setattr(registry, "_found", None)  # as in a child process
     assert find_task("post").name == "post"
-    with pytest.raises(UsageError, match=r"'post_task:Nothing' .* has no attribute"):
+    with pytest.raises(UsageError, match=r"task post_task:Nothing .* no attribute .*; repair the"):
         register_task("post_task:Nothing")
+
+
+@pytest.mark.usefixtures("post")
+def test_a_reference_to_the_class_of_an_installed_task_is_that_task() -> None:
+    assert register_task("post_task:PostTask") == "post"
+    assert len([entry for entry in task_entries() if entry.name == "post"]) == 1
+
+
+@pytest.mark.parametrize("result", ["[0.0] * 6", "[float('nan')] * 7", "1 / 0"])
+def test_a_defective_oracle_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: str
+) -> None:
+    oracle = f"    def oracle(self):\n        return {result}\n\n    def rewards"
+    changed(tmp_path, monkeypatch, "    def rewards", oracle)
+    env = VectorEnv(sim_config.EnvConfig(), 1, render_depth=False)
+    env.reset([Scenario("post", 0, 0)])
+    found = r"task post \(post_task:PostTask\): (its oracle returns|ZeroDivisionError)"
+    with pytest.raises(EnvironmentFailure, match=found):
+        Oracle().act(env)
 
 
 def test_a_task_of_another_robot_needs_its_class(
@@ -306,6 +338,10 @@ class Reach(RobotTask):
 class Nobody(Reach):
     name = "nobody"
     robot_class = None
+
+class Text(Reach):
+    name = "text"
+    robot_class = "robot"
 """
     (tmp_path / "robot_tasks.py").write_text(source)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -313,6 +349,8 @@ class Nobody(Reach):
         register_task("robot_tasks:Reach")
     with pytest.raises(UsageError, match="lacks robot_class;"):
         register_task("robot_tasks:Nobody")
+    with pytest.raises(UsageError, match="robot_class is 'robot', expected a subclass of MujocoR"):
+        register_task("robot_tasks:Text")
 
 
 def test_a_task_of_another_robot_must_be_a_robot_task(
