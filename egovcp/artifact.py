@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -368,3 +369,28 @@ def returns_of(artifact: Artifact) -> ReturnConfig:
         raise ArtifactError(
             f"{artifact.path / MANIFEST}: {error}; train again with this version"
         ) from error
+
+
+def require_same_returns(
+    state: Mapping[str, Tensor], returns: ReturnConfig, where: str, flag: str = "--returns"
+) -> None:
+    """Raise `UsageError` unless the Q of a model that is trained on has the discount and the scale
+    of the options ``flag``, which are part of its state.
+
+    Args:
+        state: `WorldModel.state_dict` of the model.
+        where: what the model comes from, for the message.
+    """
+    is_scaled = bool(state["return_mean"] != 0 or state["return_std"] != 1)
+    discount = float(state["discount"])
+    gamma = returns.gamma if math.isclose(returns.gamma, discount, rel_tol=1e-6) else discount
+    options = {
+        "gamma": (f"{returns.gamma:.6g}", f"{gamma:.6g}"),
+        "scale": (returns.scale, "dataset" if is_scaled else "none"),
+    }
+    for name, (given, found) in options.items():
+        if given != found:
+            raise UsageError(
+                f"{flag}.{name}={given}, but the Q of {where} was trained with {found}; give "
+                f"{flag}.{name}={found}, or start a new run without its weights"
+            )

@@ -213,23 +213,24 @@ def exit_on_sigint(prog: str) -> None:
 
 
 def raise_on_sigint() -> None:
-    """Raise KeyboardInterrupt on SIGINT, delayed until a running import has finished.
+    """Let SIGINT call `raise_interrupt`.
 
     Replaces only the handler of `exit_on_sigint`; other handlers stay in place.
     """
+    if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == __name__:
+        signal.signal(signal.SIGINT, raise_interrupt)
+
+
+def raise_interrupt(number: int, frame: FrameType | None) -> None:
+    """Signal handler: raise KeyboardInterrupt, delayed until a running import has finished."""
     import threading  # slow: after SIGINT is handled
 
+    if not _is_importing(frame):
+        raise KeyboardInterrupt
     main = threading.main_thread().ident
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if not _is_importing(frame):
-            raise KeyboardInterrupt
-        retry = threading.Timer(_RETRY_S, signal.pthread_kill, [main, signal.SIGINT])
-        retry.daemon = True
-        retry.start()
-
-    if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == __name__:
-        signal.signal(signal.SIGINT, interrupt)
+    retry = threading.Timer(_RETRY_S, signal.pthread_kill, [main, number])
+    retry.daemon = True
+    retry.start()
 
 
 def _is_importing(frame: FrameType | None) -> bool:

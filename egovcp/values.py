@@ -221,11 +221,12 @@ def _items(kind: Any, value: Any, name: str, strict: bool) -> Iterator[Any]:
 
 
 def collection_or_text(text: str) -> Any:
-    """The value of a YAML text, or the text itself if it is not YAML."""
+    """The collection or string that a YAML text holds; else, as for a number, the text itself."""
     try:
-        return parse_collection(text)
+        found = parse_collection(text)
     except ValueError:
         return text
+    return found if isinstance(found, dict | list | str) else text
 
 
 def _text(value: Any, name: str) -> str:

@@ -1,12 +1,16 @@
-"""Worker processes: what they inherit, and graceful stops."""
+"""Worker processes: what they inherit, their errors, and graceful stops."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import signal
 from collections.abc import Iterator, Sequence
+from types import FrameType
 from typing import Final
+
+from egovcp.entry_point import raise_interrupt
 
 _THREAD_LIMITS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -43,9 +47,9 @@ def stop_on_signal(
     """
     received: list[int] = []
 
-    def note(number: int, frame: object) -> None:
+    def note(number: int, frame: FrameType | None) -> None:
         if received and interrupt:
-            raise KeyboardInterrupt
+            raise_interrupt(number, frame)
         received.append(number)
 
     previous = {s: signal.signal(s, note) for s in signals}
@@ -54,3 +58,12 @@ def stop_on_signal(
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def is_picklable(error: Exception) -> bool:
+    """Whether another process can receive the error."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - bytes made in this expression
+    except Exception:  # noqa: BLE001 - an exception class may raise anything here
+        return False
+    return True

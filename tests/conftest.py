@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, redirect_hub
 
 # a shell that starts the tests in the background has them, and what they start, ignore it
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -51,6 +51,6 @@ def hub(tmp_path: Path) -> Iterator[FakeHub]:
     """A fake Hub, to which this process's libraries talk, with all caches in ``tmp_path``."""
     with (
         FakeHub(tmp_path / "hub") as hub,
-        in_this_process(hub.endpoint, tmp_path / "home"),
+        redirect_hub(hub.endpoint, tmp_path / "home"),
     ):
         yield hub

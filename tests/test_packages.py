@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import DISTRIBUTIONS, distribution_of
 from tests.support.limited import LimitedResult, run_limited
-from tests.support.requirements import installed_with
+from tests.support.requirements import required_distributions
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Distribution -> folder of its pyproject.toml.
@@ -84,7 +84,7 @@ def test_an_import_is_found_anywhere_but_for_type_checkers() -> None:
 
 def absent_modules(distribution: str) -> Iterator[str]:
     """Top-level modules that are not there where only this distribution is installed."""
-    present = installed_with(distribution)
+    present = required_distributions(distribution)
     owners = {**metadata.packages_distributions(), **{m: [d] for m, d in DISTRIBUTIONS.items()}}
     for module, distributions in owners.items():
         if not present.intersection(map(canonicalize_name, distributions)):

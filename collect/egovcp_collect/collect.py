@@ -101,6 +101,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
             f"{committer.committed} episodes, {committer.frames} steps, {rate:.0f} steps/s{waiting}"
         )
         if stopped and committer.committed < config.episodes:
+            echo(f"{PROG}: run the same command with --resume to continue", error=True)
             raise KeyboardInterrupt
         if committer.committed < config.episodes:  # the first missing one stopped the commit
             raise DataError(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds, check_cores
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
@@ -14,7 +14,7 @@ from egovcp.sim.config import EnvConfig, require_memory_for_robots, short_episod
 from egovcp.sim.policies import require_ordered_steps
 from egovcp.sim.scenario import Scenario, require_training_seed
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
-from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT
+from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, HELD_ETA, HELD_TICKS
 
 #: Options that determine the content of an episode; the others only schedule the work.
 EPISODE_OPTIONS: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
@@ -60,10 +60,10 @@ class CollectConfig:
     """Replace a worker that sends no report for this long, s."""
     num_envs: int = bounded(16, least=1, most=65_536)
     """Robots that each process simulates in parallel."""
-    eta: float = bounded(1.0, above=0, most=2)
-    """Largest step of the random walk, action box units; a step above the rate limit of 0.32 per
-    planner tick (40 ms) is sent as a ramp."""
-    step_ticks: tuple[int, int] = bounded((5, 15), least=1, most=100_000)
+    eta: float = bounded(HELD_ETA, above=0, most=2)
+    """Largest step of the random walk, normalised action units ([-1, 1]; 1 is half the range); a
+    step above the rate limit of 0.32 per planner tick (40 ms) is sent as a ramp."""
+    step_ticks: tuple[int, int] = bounded(HELD_TICKS, least=1, most=100_000)
     """Shortest and longest interval between steps of the walk, planner ticks; (1, 1) needs
     --eta of 0.32 or less; --preset=paper is the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
@@ -73,8 +73,6 @@ class CollectConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for invalid values and combinations."""
-        check_bounds(self, "--")
-        check_cores(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         require_training_seed(self.seed)
@@ -88,7 +86,7 @@ class CollectConfig:
                 f"{', '.join(tasks)}"
             )
         shortest, longest = require_ordered_steps(self.step_ticks)
-        reachable = min(2.0, shortest * ACTION_RATE_LIMIT)
+        reachable = shortest * ACTION_RATE_LIMIT
         if self.eta > reachable:
             raise UsageError(
                 f"--eta={self.eta}: expected more than 0 and at most {reachable:g}, which is what "

@@ -26,7 +26,7 @@ from egovcp.data import Episode
 from egovcp.data.staging import StagingDir, encode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp.workers import inherited_by_workers
+from egovcp.workers import inherited_by_workers, is_picklable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
@@ -161,15 +161,6 @@ class WorkerReport:
     """The error that ended the worker; this is its last report."""
 
 
-def as_picklable(error: Exception) -> Exception:
-    """The error, or a `RuntimeError` with its message if it cannot be pickled."""
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 - bytes made in this expression
-    except Exception:  # noqa: BLE001 - an exception class may raise anything here
-        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
-    return error
-
-
 class Worker:
     """A process that stages its episodes on the disk itself; reports come through a pipe."""
 
@@ -247,7 +238,8 @@ def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: 
         return
     except Exception as error:  # noqa: BLE001 - every error is reported to the collection
         error.add_note(traceback.format_exc())
-        pipe.send(WorkerReport(0, error=as_picklable(error)))
+        text = "".join(traceback.format_exception_only(error)).strip()
+        pipe.send(WorkerReport(0, error=error if is_picklable(error) else RuntimeError(text)))
 
 
 def _stage(staging: StagingDir, number: int, episode: Episode) -> int:

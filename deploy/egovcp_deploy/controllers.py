@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from egovcp.bounds import as_flag_value
 from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError, read_json
+from egovcp.flags import merged
 from egovcp.plan import PolicyStep
 from egovcp.sim.base_env import BaseVectorEnv
 from egovcp.sim.policies import Constant, EnvPolicy, Hold, Oracle, RandomWalk
@@ -130,12 +131,12 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
             "checked",
             error=True,
         )
-    for name, (old, new) in differences(known, setting):
-        if old is not None:  # None: unknown, as an option of a later version
-            raise UsageError(
-                f"--constant.path={path} was found with {name}={as_flag_value(old)}, expected "
-                f"{as_flag_value(new)}; omit --constant.path to search the best action again"
-            )
+    # An option that the file lacks is one of a later version, and unknown.
+    for name, (old, new) in differences(merged(setting, known), setting):
+        raise UsageError(
+            f"--constant.path={path} was found with {name}={as_flag_value(old)}, expected "
+            f"{as_flag_value(new)}; omit --constant.path to search the best action again"
+        )
     return constants
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from egovcp import spec
 from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
 from egovcp.checks.lerobot_dataset import STALE, LeRobotCheck, Progress, lerobot_problems
-from egovcp.checks.lerobot_episode import numbers_in
+from egovcp.checks.lerobot_episode import wrong_statistics
 from egovcp.data import DatasetReader, Episode, metadata, schema, stats
+from egovcp.data.features import Feature, parse_feature
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
 from egovcp.data.metadata import hash_problems
 from egovcp.data.parquet import data_errors, open_parquet
@@ -176,9 +177,11 @@ def _episode_statistics_problems(
     reader: DatasetReader, row: EpisodeRow, matrix: stats.Matrix
 ) -> Iterator[DataError]:
     """Differences of the statistics in ``meta/episodes`` from those (R, D) of the frames."""
-    for key, part in _checked(reader):
-        for problem in _differences(row.stats(key), matrix[:, part], row.length):
-            yield DataError.at(row.table_path, f"statistics of {key}: {problem}", row.index)
+    for feature, part in _checked(reader):
+        found = row.stats(feature.key)
+        for problem in _statistics_problems(found, matrix[:, part], row.length, feature):
+            problem = f"statistics of {feature.key}: {problem}"
+            yield DataError.at(row.table_path, problem, row.index)
 
 
 def _total_problems(
@@ -193,28 +196,28 @@ def _total_problems(
     if len(matrices) != len(reader):
         return
     total = stats.aggregate(matrices, reader.lengths.tolist())
-    for key, part in _checked(reader):
-        if isinstance(found.get(key), dict):
-            for problem in _differences(found[key], total[:, part], reader.num_frames):
-                yield DataError.at(path, f"{key}: {problem}")
+    for feature, part in _checked(reader):
+        given = found.get(feature.key)
+        if isinstance(given, dict):
+            for problem in _statistics_problems(given, total[:, part], reader.num_frames, feature):
+                yield DataError.at(path, f"{feature.key}: {problem}")
 
 
-def _checked(reader: DatasetReader) -> Iterator[tuple[str, slice]]:
+def _checked(reader: DatasetReader) -> Iterator[tuple[Feature, slice]]:
     """The features whose statistics are compared, and their columns of a matrix."""
-    places = stats.layout(reader.robot)
-    return ((key, places[key]) for key in reader.features if key not in STALE)
+    places, info = stats.layout(reader.robot), reader.info["features"]
+    for key in reader.features:
+        if key not in STALE:
+            yield parse_feature(key, info[key]), places[key]
 
 
-def _differences(found: Mapping[str, object], part: stats.Matrix, frames: int) -> Iterator[str]:
-    least, most, mean = part[0], part[1], part[2]
-    slack = _RELATIVE * (most - least + np.abs(mean)) + _ABSOLUTE
-    for name, expected in zip(stats.ROWS, part, strict=True):
-        values = numbers_in(found.get(name))
-        if values is None or values.shape != expected.shape:
-            yield f"{name} is missing or has not {len(expected)} numbers"
-        elif not (np.abs(values - expected) <= slack).all():
-            at = int(np.argmax(~(np.abs(values - expected) <= slack)))
-            yield f"{name} of value {at} is {values[at]:.6g}, its frames have {expected[at]:.6g}"
+def _statistics_problems(
+    found: Mapping[str, object], part: stats.Matrix, frames: int, feature: Feature
+) -> Iterator[str]:
+    expected = dict(zip(stats.ROWS, part, strict=True))
+    scale = expected["max"] - expected["min"] + np.abs(expected["mean"])
+    slacks = dict.fromkeys(expected, _RELATIVE * scale + _ABSOLUTE)
+    yield from wrong_statistics(found, expected, slacks, feature)
     count = found.get("count")
     if count != [frames] or not isinstance(count, list) or isinstance(count[0], bool):
         yield f"count is {count!r:.80}, expected [{frames}]"

@@ -30,7 +30,7 @@ from egovcp.checks.lerobot_episode import (
 )
 from egovcp.data import schema
 from egovcp.data.features import values_of
-from egovcp.data.lerobot import EpisodeRow, LeRobotReader
+from egovcp.data.lerobot import EpisodeRow, LeRobotReader, episode_runs
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.pictures import decode_frames, frame_times
 from egovcp.data.stats import aggregate_named
@@ -69,10 +69,15 @@ class LeRobotCheck:
 
     def __init__(self, reader: LeRobotReader, every: bool = False) -> None:
         self.reader, self._every = reader, every
+        table = reader.root / "meta" / "episodes"
+        self._has_table = not any(Path(e.file).is_relative_to(table) for e in reader.problems)
+        ends = [0, *(row.end for row in reader.rows)]
+        in_order = all(row.start == end for row, end in zip(reader.rows, ends, strict=False))
         self.by_number: dict[int, EpisodeRow] = {}
-        """Number -> its first row in ``meta/episodes``."""
-        for row in reader.rows:
-            self.by_number.setdefault(row.index, row)
+        """Number N -> row N of ``meta/episodes``, or, if ``every`` or rows are missing, the first
+        with this ``episode_index``."""
+        for number, row in enumerate(reader.rows):
+            self.by_number.setdefault(row.index if every or not in_order else number, row)
         self._seen: dict[int, Path] = {}
         self._frames = 0
         self._reported: set[tuple[Path, str]] = set()
@@ -88,7 +93,7 @@ class LeRobotCheck:
         names = set(reader.tasks.values())
         end = 0
         for number, row in enumerate(reader.rows):
-            for problem in _row_problems(row, number, end):
+            for problem in _row_problems(row, number, end) if self._has_table else ():
                 yield DataError.at(row.table_path, problem, row.index)
             end = row.end
             if unknown := sorted(set(row.tasks) - names) if names else []:
@@ -116,24 +121,28 @@ class LeRobotCheck:
 
     def file_problems(self, path: Path, progress: Progress | None = None) -> Iterator[DataError]:
         """Problems of a data file, its episodes, and their videos and statistics."""
-        listed = [row.index for row in self.by_number.values() if row.data_path == path]
+        lengths = {n: row.length for n, row in self.by_number.items() if row.data_path == path}
+        listed, rows = [*lengths], sum(lengths.values())
         try:
-            names = self.reader.open_data(path).schema_arrow.names
+            file = self.reader.open_data(path)
+            names = file.schema_arrow.names
+            fits = rows == file.metadata.num_rows and min(lengths.values(), default=0) > 0
+            if not fits and "episode_index" not in names:
+                raise DataError.at(path, "lacks the column episode_index")
         except DataError as error:
-            self._frames += sum(self.by_number[number].length for number in listed)
+            self._frames += rows
             problem = f"{error.problem}{_lost(listed)}"
             yield DataError.at(path, problem, listed[0] if listed else None)
             return
         columns = [k for k, f in self.reader.features.items() if f.dtype != "video"]
-        if "episode_index" not in names:
-            yield DataError.at(path, "lacks the column episode_index")
-            return
         if unknown := sorted(set(names) - set(columns)):
             problem = f"columns that {schema.INFO_PATH} does not know: {', '.join(unknown)}"
             yield DataError.at(path, problem)
-        present = [key for key in columns if key in names]
+        present = [k for k in dict.fromkeys([*columns, "episode_index"]) if k in names]
         found, damaged = set[int](), set[int]()
-        for part in self.reader.episodes(path, present):
+        # If as many rows are listed as there are, episode_index is checked instead of used.
+        episodes = np.array([*lengths.items()]) if fits else None
+        for part in episode_runs(file, path, present, listed=episodes):
             if isinstance(part, DataError):
                 yield part
                 if part.episode in self.by_number and part.episode not in found:
@@ -155,7 +164,7 @@ class LeRobotCheck:
     def total_problems(self) -> Iterator[DataError]:
         """Problems of the whole: episodes in no table, and ``stats.json``."""
         reader = self.reader
-        if unlisted := sorted(set(self._seen) - set(self.by_number)):
+        if self._has_table and (unlisted := sorted(set(self._seen) - set(self.by_number))):
             more = f" (and {len(unlisted) - 1} more)" if len(unlisted) > 1 else ""
             problem = f"its rows are here, but meta/episodes does not list it{more}"
             yield DataError.at(self._seen[unlisted[0]], problem, unlisted[0])
@@ -301,11 +310,15 @@ class LeRobotCheck:
                 values = found
         if values is None:
             return
-        self._valid_frames += len(table)
-        if "index" in values:
-            at = first_difference(values["index"][:, 0], first + np.arange(len(table)))
+        for key, start, step in (("episode_index", number, 0), ("index", first, 1)):
+            counts = start + step * np.arange(len(table))
+            at = first_difference(values[key][:, 0], counts) if key in values else None
             if at is not None:
-                yield DataError.at(path, f"column index does not count from {first}", number, at)
+                problem = f"column {key} is {values[key][at, 0]}, expected {counts[at]}"
+                yield DataError.at(path, problem, number, at)
+                if key == "episode_index":  # its statistics are of other rows
+                    return
+        self._valid_frames += len(table)
         for key, feature in self.reader.features.items():
             if key not in values or not feature.is_numeric or key in STALE:
                 continue

@@ -133,18 +133,25 @@ def statistics_problems(
     LeRobot computes them in float32, and the variance as E[x^2] - E[x]^2, so that small deviations
     are no contradiction.
     """
+    least = numbers_in(found.get("min"))
+    if least is not None and len(feature.shape) > 1 and len(least) == feature.size:
+        return  # of an episode with a single frame, for which LeRobot reduces no axis
     largest = np.maximum(np.abs(expected["min"]), np.abs(expected["max"]))
-    spread = expected["max"] - expected["min"]
-    slack = 1e-4 * largest + 1e-3 * spread + 1e-6
+    slack = 1e-4 * largest + 1e-3 * (expected["max"] - expected["min"]) + 1e-6
+    slacks = {**dict.fromkeys(expected, slack), "std": slack + 5e-3 * largest}
+    yield from wrong_statistics(found, expected, slacks, feature)
+
+
+def wrong_statistics(
+    found: Mapping[str, object], expected: Statistics, slacks: Statistics, feature: Feature
+) -> Iterator[str]:
+    """Recorded statistics that are missing, or off by more than their slack."""
     for name, want in expected.items():
         values = numbers_in(found.get(name))
-        if values is not None and len(feature.shape) > 1 and len(values) == feature.size:
-            return  # of an episode with a single frame, for which LeRobot reduces no axis
         if values is None or values.shape != want.shape:
-            yield f"{name} is missing or has not {len(want)} numbers"
+            yield f"{name} is missing or does not have {len(want)} numbers"
             continue
-        off = np.abs(values - want)
-        wrong = ~(off <= (slack + 5e-3 * largest if name == "std" else slack))
+        wrong = ~(np.abs(values - want) <= slacks[name])
         if wrong.any():
             at = int(np.argmax(wrong))
             yield (

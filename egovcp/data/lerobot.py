@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from egovcp.data import metadata, schema
 from egovcp.data.features import Feature, parse_feature
@@ -244,23 +245,26 @@ def episode_runs(
     path: Path,
     columns: Sequence[str] | None = None,
     only: int | None = None,
+    listed: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[int, pa.Table] | DataError]:
     """(``episode_index``, rows) of the consecutive rows of each episode in a data file.
 
     Episodes may span row groups, which are read one at a time. A damaged one gives an error for
     each of its episodes, if they can be determined. Row groups whose statistics exclude the episode
-    ``only`` are skipped.
+    ``only`` are skipped. ``listed``, number and length (E, 2) of all episodes, replaces the column.
     """
-    number, parts = -1, list[pa.Table]()
+    number, parts, row = -1, list[pa.Table](), 0
     for group in range(file.num_row_groups):
+        first, row = row, row + file.metadata.row_group(group).num_rows
+        given = None if listed is None else _numbers(listed, np.arange(first, row))
         try:
             with data_errors(path):
                 if only is not None and not _may_hold(file.metadata.row_group(group), only):
                     continue
                 table = file.read_row_group(group, columns=columns, use_threads=False)
-                runs = list(_split_by_episode(table))
+                runs = list(_split_by_episode(table, given))
         except DataError as error:
-            lost = _episode_numbers(file, group)
+            lost = _episode_numbers(file, group) if given is None else np.unique(given).tolist()
             if not lost:
                 yield DataError.at(path, f"{error.problem} (row group {group})")
                 continue
@@ -279,12 +283,20 @@ def episode_runs(
         yield number, pa.concat_tables(parts)
 
 
-def _split_by_episode(table: pa.Table) -> Iterator[tuple[int, pa.Table]]:
-    """Consecutive rows with the same ``episode_index``."""
-    column = table["episode_index"]
-    if column.null_count:
-        raise DataError.without_place("column episode_index has a null value")
-    numbers = np.asarray(column.to_numpy(), np.int64)
+def _numbers(listed: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The episodes (n,) of rows (n,) of a file with episodes ``listed``, see `episode_runs`."""
+    return np.asarray(listed[np.searchsorted(listed[:, 1].cumsum(), rows, "right"), 0])
+
+
+def _split_by_episode(
+    table: pa.Table, numbers: NDArray[np.int64] | None
+) -> Iterator[tuple[int, pa.Table]]:
+    """Consecutive rows with the same number; None: with the same ``episode_index``."""
+    if numbers is None:
+        column = table["episode_index"]
+        if column.null_count:
+            raise DataError.without_place("column episode_index has a null value")
+        numbers = np.asarray(column.to_numpy(), np.int64)
     edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     for first, last in itertools.pairwise(edges):
         if last > first:

@@ -24,6 +24,7 @@ from typing import Any, Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.log.tick import Sink
+from egovcp.workers import is_picklable
 
 NICENESS: Final = 5  # the control loop has priority on a shared core
 _PIPE_BYTES: Final = 1 << 20  # several ticks; the default of 64 KiB does not hold one
@@ -105,7 +106,7 @@ def serve(commands: Connection, reports: Connection) -> None:
         sink.close()
         _report(reports, None)
     except Exception as error:  # noqa: BLE001 - every error is reported to the parent
-        _report(reports, _as_picklable(error))
+        _report(reports, _failure(error))
         with suppress(Exception):
             if sink is not None:
                 sink.close()
@@ -117,12 +118,10 @@ def _report(reports: Connection, report: WriterReport) -> None:
         reports.send(report)
 
 
-def _as_picklable(error: Exception) -> Exception:
+def _failure(error: Exception) -> Exception:
     """The error itself if it is an `EgovcpError` or `OSError` and can be pickled, else its text."""
-    if isinstance(error, EgovcpError | OSError):
-        with suppress(Exception):
-            pickle.dumps(error)
-            return error
+    if isinstance(error, EgovcpError | OSError) and is_picklable(error):
+        return error
     traceback.print_exception(error)
     return EnvironmentFailure(f"{type(error).__name__}: {error}")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egovcp.errors import DataError
+from egovcp.errors import DataError, UsageError
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks import task_names
 from egovcp.spec import ACTION_DIM
@@ -83,6 +83,14 @@ def test_constant_json_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "constant.json"
     path.write_text(json.dumps({"constants": {"ball": entry}}))
     assert load_constants(path, {})["ball"].action == (0.1,) * ACTION_DIM
+
+
+def test_an_option_that_was_null_is_compared_and_a_later_one_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "constant.json"
+    path.write_text(json.dumps({"constants": {}, "env": {"limit": None}}))
+    assert load_constants(path, {"env": {"limit": None, "later": 3}}) == {}
+    with pytest.raises(UsageError, match=r"found with env\.limit=null, expected 3"):
+        load_constants(path, {"env": {"limit": 3}})
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,20 @@ def test_text_stays_as_it_is_written(text: str) -> None:
     assert _parse(f"--dataset.revision={text}").dataset.revision == text
 
 
+@dataclass(frozen=True)
+class Folders:
+    """A command that takes one folder, or several."""
+
+    folders: list[str] | str = ""
+    """Folders."""
+
+
+@pytest.mark.parametrize("text", ["007", "1e5", "2026", "2026-11-30", "true", "null"])
+def test_text_that_may_be_a_list_stays_as_it_is_written(text: str) -> None:
+    assert parse_config(Folders, [f"--folders={text}"], PROG).folders == text
+    assert parse_config(Folders, [f"--folders=['{text}', b]"], PROG).folders == [text, "b"]
+
+
 def test_what_is_saved_parses_to_the_same(tmp_path: Path) -> None:
     config = Config(name="x: y", sizes=(9, 8, 7), loud=True, ball=Ball(radius=0.2))
     save_config(config, str(tmp_path / "config.yaml"))
@@ -217,6 +231,13 @@ def test_a_preset_sets_nested_values_and_a_flag_overrides_one_of_them() -> None:
     assert _with_preset("--preset", "large").ball == PRESETS["large"]
     for argv in (["--preset=large", "--ball.bounces=1"], ["--ball.bounces=1", "--preset=large"]):
         assert _with_preset(*argv).ball == Ball(radius=0.5, bounces=1, colour="blue")
+
+
+def test_help_shows_the_defaults_of_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    for argv, bounces in (["--help=ball"], 3), (["--preset=large", "--help=ball"], 7):
+        with pytest.raises(SystemExit):
+            _with_preset(*argv)
+        assert f"(default: {bounces})" in capsys.readouterr().out
 
 
 # --- what is refused --------------------------------------------------------------------
@@ -342,11 +363,14 @@ def test_an_error_is_one_line_and_a_traceback_only_with_debug(
     assert plain.out == ""
     assert plain.err.startswith(f"{PROG}: error: the dataset is bad")
     assert plain.err.count("\n") == 1
-    for argv in (["--debug"], ["--count=2", "--debug"], ["--debug", "--loud"], ["--debug=true"]):
-        assert _run(*argv, error=error) > 0
+    for line in ("--debug", "--count=2 --debug", "--debug --loud", "--debug=True", "--debug yes"):
+        assert _run(*line.split(), error=error) > 0
         assert "Traceback" in capsys.readouterr().err
-    assert _run("--debug", "--debug=false", error=error) > 0
-    assert "Traceback" not in capsys.readouterr().err
+    for line in ("--debug --debug=false", "--debug off"):
+        assert _run(*line.split(), error=error) > 0
+        assert "Traceback" not in capsys.readouterr().err
+    assert _run("--debug=maybe", error=error) == 2
+    assert "--debug=maybe: expected bool" in capsys.readouterr().err
 
 
 def test_debug_is_no_option_of_the_command_itself() -> None:
@@ -405,7 +429,7 @@ def test_help_lists_the_groups_that_it_leaves_out(capsys: pytest.CaptureFixture[
         _run("--help")
     text = capsys.readouterr().out
     assert "--lamp.stand.height_range" not in text
-    assert re.search(r"^  lamp \(1 options?\) ", text, re.MULTILINE)
+    assert re.search(r"^  lamp\.stand \(1 option\) ", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("sizes", ["(4,5,6)", "[4,5,6]", "( 4, 5, 6 )", "[4, 5, 6,]"])

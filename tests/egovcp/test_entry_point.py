@@ -81,13 +81,23 @@ def test_an_interrupt_during_work_ends_the_command(run: Run) -> None:
     assert done.stderr == b"egovcp-test: interrupted\n"
 
 
-def test_an_interrupt_during_a_late_import_is_delivered_after_it(run: Run, tmp_path: Path) -> None:
-    late = f"try:\n    import os, signal\n    {INTERRUPT.splitlines()[1]}\n"
+@pytest.mark.parametrize(
+    ("name", "context"),
+    [("SIGINT", "contextlib.nullcontext([])"), ("SIGTERM", "workers.stop_on_signal()")],
+)
+def test_an_interrupt_during_a_late_import_is_delivered_after_it(
+    name: str, context: str, run: Run, tmp_path: Path
+) -> None:
+    """Without `stop_on_signal` the first signal is one, with it the second."""
+    late = f"try:\n    import os, signal\n    os.kill(os.getpid(), signal.{name})\n"
     late += "except BaseException:\n    pass\n"
     (tmp_path / "late_import.py").write_text(late, encoding="utf-8")
-    body = "def run(config):\n    import late_import, time\n    print('imported', flush=True)\n"
-    done = run(f"{RUN_COMMAND}{body}    time.sleep(30)\n")
+    body = "import contextlib, time\nfrom egovcp import workers\ndef run(config):\n"
+    body += f"    with {context} as received:\n        received.append(15)\n"
+    body += "        import late_import\n        print('imported', flush=True)\n"
+    done = run(f"{RUN_COMMAND}{body}        time.sleep(30)\n")
     assert done.returncode == 130
+    assert done.stdout == b"imported\n"
     assert done.stderr == b"egovcp-test: interrupted\n"
 
 

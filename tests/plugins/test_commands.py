@@ -20,7 +20,7 @@ from egovcp.data.pictures import decode_frames
 from egovcp.manifest import PROCESSORS
 from egovcp.robot.stance import StanceController
 from lerobot_policy_egovcp import EgovcpPolicy
-from tests.support.hub import FakeHub, environment, in_this_process
+from tests.support.hub import FakeHub, hub_environment, redirect_hub
 
 PLUGINS = sorted((Path(__file__).resolve().parents[2] / "plugins").iterdir())
 POLICY = "me/policy"
@@ -46,7 +46,7 @@ def surroundings(hub: FakeHub, tmp_path_factory: pytest.TempPathFactory) -> dict
         note.write_text(f"Metadata-Version: 2.3\nName: {name}\nVersion: {version}\n")
     paths = [str(place), *map(str, PLUGINS), os.environ.get("PYTHONPATH", "")]
     own = {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "HF_TOKEN": TOKEN}
-    return os.environ | environment(hub.endpoint, place) | own
+    return os.environ | hub_environment(hub.endpoint, place) | own
 
 
 def _run(surroundings: dict[str, str], program: str, *options: str) -> str:
@@ -121,7 +121,7 @@ def test_what_it_publishes_is_the_artifact(
     assert re.search(rf"Model pushed to {hub.endpoint}/\S*{POLICY}", log)
     assert hub.store.refs(f"models/{POLICY}").private
     monkeypatch.setenv("HF_TOKEN", TOKEN)
-    with in_this_process(hub.endpoint, tmp_path):
+    with redirect_hub(hub.endpoint, tmp_path):
         check_artifact(POLICY)
         policy = EgovcpPolicy.from_pretrained(POLICY)
         published = HfApi(endpoint=hub.endpoint, token=TOKEN).list_repo_files(POLICY)

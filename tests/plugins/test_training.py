@@ -190,6 +190,22 @@ def test_an_artifact_of_egovcp_train_can_be_trained_further(
         assert torch.equal(value, statistics[name]), name
 
 
+@pytest.mark.parametrize(
+    ("returns", "found"),
+    [
+        (ReturnConfig(steps=4, gamma=0.9), r"gamma=0\.9, .* give --policy\.returns\.gamma=0\.97"),
+        (ReturnConfig(steps=4, scale="none"), r"scale=none, .* --policy\.returns\.scale=dataset"),
+    ],
+)
+def test_weights_of_another_return_are_refused_for_training(
+    returns: ReturnConfig, found: str, artifact: Path, config: EgovcpConfig,
+    meta: LeRobotDatasetMetadata,
+) -> None:  # fmt: skip
+    config.returns, config.pretrained_path = returns, artifact
+    with pytest.raises(UsageError, match=rf"--policy\.returns\.{found}"):
+        make_policy(config, ds_meta=meta)
+
+
 def test_rows_of_files_that_were_not_downloaded_are_not_valid(tmp_path: Path) -> None:
     """Of --dataset.episodes, LeRobot downloads only the files."""
     root, config = tmp_path / "dataset", ReturnConfig(steps=4)

@@ -10,7 +10,7 @@ from packaging.utils import canonicalize_name
 
 
 @cache
-def installed_with(distribution: str) -> frozenset[str]:
+def required_distributions(distribution: str) -> frozenset[str]:
     """Names of a distribution without extras and of all that it requires, recursively."""
     found: set[tuple[str, str]] = set()
 

@@ -66,3 +66,17 @@ class MemorySink:
 
     def close(self) -> None:
         pass
+
+
+class LibraryError(OSError):
+    """An error as of a library; `pickle.loads` raises TypeError."""
+
+    def __init__(self, *, reason: str) -> None:
+        super().__init__(reason)
+
+
+class BrokenSink(MemorySink):
+    """Raises an error that cannot be sent to another process."""
+
+    def write(self, tick: Tick) -> None:
+        raise LibraryError(reason="it broke")

@@ -17,7 +17,7 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 
-from tests.support.hub import FakeHub, files, in_this_process
+from tests.support.hub import FakeHub, files, redirect_hub
 
 REPO = "me/things"
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,7 +72,7 @@ def test_any_part_of_a_file_can_be_read(api: HfApi) -> None:
 
 
 def test_large_content_is_uploaded_once(api: HfApi, hub: FakeHub) -> None:
-    hub.heal()
+    hub.reset()
     commit(api, CommitOperationAdd("data/b/same.parquet", LARGE))
     assert (hub.requests["lfs_batch"], hub.requests["lfs_upload"]) == (1, 0)
 
@@ -122,7 +122,7 @@ def locked(tmp_path: Path) -> Iterator[FakeHub]:
     """A Hub that wants a token."""
     with (
         FakeHub(tmp_path / "hub", token="hf_right") as hub,
-        in_this_process(hub.endpoint, tmp_path / "home"),
+        redirect_hub(hub.endpoint, tmp_path / "home"),
     ):
         yield hub
 
@@ -148,7 +148,7 @@ def test_repositories_outlive_the_server(api: HfApi, hub: FakeHub, tmp_path: Pat
 
 
 def test_faults_apply_to_the_given_requests(api: HfApi, hub: FakeHub) -> None:
-    hub.heal()
+    hub.reset()
     hub.fail("info", 418, times=1, after=1, message="out of tea")
     api.dataset_info(REPO)
     with pytest.raises(HfHubHTTPError, match="out of tea"):

@@ -22,7 +22,7 @@ from egovcp.testing import toy_model
 from egovcp_train import publish as publishing
 from egovcp_train.publish import main as push
 from egovcp_train.train import main as train
-from tests.support.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, redirect_hub
 
 type Arguments = Callable[..., list[str]]
 
@@ -181,7 +181,7 @@ def test_a_token_that_may_not_write_is_refused_before_training(
     run = tmp_path / "run"
     with (
         FakeHub(tmp_path / "hub", token="hf_other") as hub,
-        in_this_process(hub.endpoint, tmp_path / "home"),
+        redirect_hub(hub.endpoint, tmp_path / "home"),
     ):
         _refused(arguments(run, *TO_HUB), run, 5, capsys, "write access to models of me")
 
@@ -198,7 +198,7 @@ def test_a_failed_push_keeps_the_run_and_names_the_command_that_repeats_it(
     assert shown.err.splitlines()[-1].startswith("egovcp-train: error: ")
     assert check_artifact(str(_last(run))).manifest["step"] == 6
     assert hub.requests["commit"] == 0
-    hub.heal()
+    hub.reset()
     name, *again = shlex.split(shown.err.strip().rpartition("repeat that with: ")[2])
     assert name == "egovcp-push"
     assert push(again) == 0
@@ -210,7 +210,7 @@ def test_a_run_that_is_stopped_is_not_published(
     hub: FakeHub, arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stopped = nullcontext([15])  # as if a signal had come
-    monkeypatch.setattr("egovcp_train.train.stop_on_signal", lambda: stopped)
+    monkeypatch.setattr("egovcp_train.train.stop_on_signal", lambda *_: stopped)
     assert train(arguments(tmp_path / "run", *TO_HUB)) == 130
     assert hub.requests["commit"] == 0
 
@@ -221,7 +221,7 @@ def test_a_resumed_run_is_published_as_it_was_told_at_first(
     run = tmp_path / "run"
     hub.fail("commit", 503)
     assert train(arguments(run, *TO_HUB)) == 5
-    hub.heal()
+    hub.reset()
     assert train([f"--output_dir={run}", "--resume"]) == 0
     assert hub.requests["commit"] == 1
     assert load_artifact("me/policy").manifest["step"] == 6

@@ -9,17 +9,16 @@ checkpoints/last -> 000500
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
 
 import torch
 
-from egovcp.artifact import load_artifact
+from egovcp.artifact import load_artifact, require_same_returns
 from egovcp.cli import given_options
 from egovcp.data import ReturnConfig
 from egovcp.data.dataset_files import sync, sync_tree
@@ -242,28 +241,3 @@ def pretrained_weights(
         )
     require_same_returns(found, returns, f"--policy.pretrained_path={path}")
     return own | found
-
-
-def require_same_returns(
-    state: Mapping[str, torch.Tensor], returns: ReturnConfig, where: str
-) -> None:
-    """Raise `UsageError` unless the Q of a model that is trained on has the options' discount and
-    scale, which are part of its state.
-
-    Args:
-        state: `WorldModel.state_dict` of the model.
-        where: what the model comes from, for the message.
-    """
-    is_scaled = bool(state["return_mean"] != 0 or state["return_std"] != 1)
-    discount = float(state["discount"])
-    gamma = returns.gamma if math.isclose(returns.gamma, discount, rel_tol=1e-6) else discount
-    options = {
-        "gamma": (f"{returns.gamma:.6g}", f"{gamma:.6g}"),
-        "scale": (returns.scale, "dataset" if is_scaled else "none"),
-    }
-    for name, (given, found) in options.items():
-        if given != found:
-            raise UsageError(
-                f"--returns.{name}={given}, but the Q of {where} was trained with {found}; give "
-                f"--returns.{name}={found}, or start a new run without its weights"
-            )

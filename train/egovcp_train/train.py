@@ -6,8 +6,8 @@ import dataclasses
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from egovcp.artifact import save_artifact
+from egovcp.artifact import require_same_returns, save_artifact
 from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
@@ -36,7 +36,6 @@ from egovcp_train.checkpoint import (
     new_checkpoint,
     prepare_output,
     pretrained_weights,
-    require_same_returns,
     restoring,
     resumed_options,
 )
@@ -113,23 +112,12 @@ def train(config: TrainConfig) -> None:
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    with reporting_full_memory(), _interrupt_on_sigterm():
+    with reporting_full_memory(), stop_on_signal([signal.SIGTERM]) as received:
+        received.append(signal.SIGTERM)  # so that the first one raises KeyboardInterrupt
         is_converted, config = bool(config.features), convert_if_needed(config)
         with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
             run = _prepare_run(config, output, device, bf16)
         run.execute()
-
-
-@contextmanager
-def _interrupt_on_sigterm() -> Iterator[None]:
-    """Handle SIGTERM as SIGINT: it raises KeyboardInterrupt, so that folders are removed."""
-    handler = signal.getsignal(signal.SIGINT)
-    handler = handler if callable(handler) else signal.default_int_handler  # SIGINT may be ignored
-    previous = signal.signal(signal.SIGTERM, handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
 
 
 def _prepare_run(
@@ -333,7 +321,8 @@ class TrainingRun:
                 f"artifact: {artifact}",
                 f"continue: {PROG} --output_dir={self.output} --resume"
                 if stopped
-                else f"next: egovcp-eval --policy.path={artifact} --task=... --output_dir=...",
+                else f"next: egovcp-eval --policy.path={artifact} --task={','.join(self.tasks)} "
+                "--output_dir=...",
             ]
         )
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.artifact import CONFIG, Artifact, load_artifact, write_artifact
+from egovcp.artifact import CONFIG, Artifact, load_artifact, require_same_returns, write_artifact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.log.picture import grey_image
@@ -95,7 +95,8 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Args:
             config: replaces the artifact's own, for another planner or other loss weights.
             dataset_stats: unused; the artifact has its own.
-            dataset_meta: a dataset to train on further, with the same low-level controller.
+            dataset_meta: a dataset to train on further, with the same low-level controller, and
+                with the discount and scale of the returns that Q was trained with.
         """
         artifact = load_artifact(str(pretrained_name_or_path), revision or "")
         if not artifact.robot.is_g1:
@@ -110,6 +111,8 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
             artifact.require_controller(policy._reader.controller_id)
+            state, where = artifact.world_model.state_dict(), f"--policy.path={artifact.path}"
+            require_same_returns(state, config.returns, where, "--policy.returns")
         policy._take(artifact)
         policy.to(config.device)
         policy.eval()

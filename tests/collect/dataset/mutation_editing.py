@@ -8,7 +8,7 @@ from typing import Final
 
 from egovcp.data.metadata import hashed_files
 from egovcp.files import sha256, write_json
-from tests.support.policy_mutations.editing import Random
+from tests.support.file_mutations import Random
 
 from .damage import (
     COLLECTION,

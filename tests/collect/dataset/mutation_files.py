@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Final
 
-from tests.support.policy_mutations.editing import Random, flip_bits, pick
+from tests.support.file_mutations import Random, flip_bits, pick
 
 from . import damage as d
 from .damage import (

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from egovcp import spec
 from egovcp.data import DatasetWriter
-from tests.support.policy_mutations.editing import Random, pick
+from tests.support.file_mutations import Random, pick
 
 from . import damage as d
 from .conftest import COLLECTED, walk

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp import spec
-from tests.support.policy_mutations.editing import Random, pick, wrong_encodings
+from tests.support.file_mutations import Random, json_mutations, pick
 
 from .damage import COLLECTION, HASHES, INFO, STATS, edit, info
 from .mutation_editing import (
@@ -16,49 +16,10 @@ from .mutation_editing import (
 )
 
 
-def _nest_json(root: Path, rng: Random) -> str:
-    name = pick(rng, (*JSON_FILES, HASHES))
-    depth = int(rng.integers(1000, 1_000_000))
-    opening, closing = pick(rng, [("[", "]"), ('{"a":', "}")])
-    _insert(root, name, opening * depth + "1" + closing * depth)
+def _write(root: Path, name: str, content: str | bytes, rng: Random) -> None:
+    (root / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     if name != HASHES:
         settle_hashes(root, rng)
-    return name
-
-
-def _write_many_values(root: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    _insert(root, name, "[" + ",".join(["[]"] * 1_500_000) + "]")
-    settle_hashes(root, rng)
-    return name
-
-
-def _write_a_constant_that_is_no_json(root: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    _insert(root, name, pick(rng, ["NaN", "Infinity", "-Infinity", "1e999", "1" * 5000]))
-    settle_hashes(root, rng)
-    return name
-
-
-def _insert(root: Path, name: str, value: str) -> None:
-    text = (root / name).read_text()
-    (root / name).write_text(text.replace("{", f'{{"extra": {value},', 1))
-
-
-def _write_json_in_another_encoding(root: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    (root / name).write_bytes(pick(rng, wrong_encodings((root / name).read_text())))
-    settle_hashes(root, rng)
-    return name
-
-
-def _write_something_else_than_an_object(root: Path, rng: Random) -> str:
-    name = pick(rng, (*JSON_FILES, HASHES))
-    texts = ["[]", "3", "null", '"text"', "true", "{}", "[{}]"]
-    (root / name).write_text(pick(rng, texts))
-    if name != HASHES:
-        settle_hashes(root, rng)
-    return name
 
 
 WRONG: Final[list[Any]] = [
@@ -152,11 +113,7 @@ def _change_statistics(root: Path, rng: Random) -> str:
 
 
 TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
-    _nest_json,
-    _write_many_values,
-    _write_a_constant_that_is_no_json,
-    _write_json_in_another_encoding,
-    _write_something_else_than_an_object,
+    *json_mutations((*JSON_FILES, HASHES), _write),
     _change_info,
     _change_data_path,
     _change_a_record,

@@ -21,7 +21,7 @@ from egovcp_collect.dataset.card import CardConfig, _size_category, card_text, s
 from egovcp_collect.dataset.cli import main
 
 from .conftest import write
-from .scenes import SETTINGS, three_balls, write_scenes
+from .episodes import SETTINGS, three_balls, write_episodes
 
 HOUSE = Path(__file__).resolve().parents[3]
 IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
@@ -30,7 +30,7 @@ IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 @pytest.fixture(scope="module")
 def carded(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
     """Three ball episodes with a card."""
-    reader = write_scenes(tmp_path_factory.mktemp("data") / "three", three_balls())
+    reader = write_episodes(tmp_path_factory.mktemp("data") / "three", three_balls())
     assert main(["card", str(reader.root), "--repo_id=me/three"]) == 0
     return reader
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from egovcp import spec
 from egovcp.data import (
     DatasetConfig,
     DatasetReader,
@@ -60,6 +61,17 @@ def test_every_problem_is_listed_up_to_the_limit(copy: Path, tmp_path: Path) -> 
     ]
     assert main(["check", str(copy), f"--json={report}", "--max_problems=2"]) == 3
     assert json.loads(report.read_text())["problems"] == problems[:2]
+
+
+def test_a_wrong_statistic_is_reported_with_the_name_of_its_value(
+    copy: Path, tmp_path: Path
+) -> None:
+    (copy / d.HASHES).unlink()
+    d.edit(d.STATS, lambda content: d.put(1, 9.0)(content["action"]["mean"]))(copy)
+    report = tmp_path / "report.json"
+    assert main(["check", str(copy), f"--json={report}"]) == 3
+    (problem,) = json.loads(report.read_text())["problems"]
+    assert f"action: mean of action[1] ({spec.ACTION_NAMES[1]}) is 9, its" in problem["problem"]
 
 
 def test_every_damaged_meta_file_is_listed(copy: Path, tmp_path: Path) -> None:

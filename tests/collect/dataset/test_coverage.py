@@ -24,15 +24,15 @@ from egovcp_collect.dataset.statistics import (
 from egovcp_collect.dataset.task_data import read_rows
 
 from . import damage as d
-from .scenes import scene, three_balls, write_scenes
+from .episodes import make_episode, three_balls, write_episodes
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three balls and an arch."""
     folder = tmp_path_factory.mktemp("data") / "four"
-    arch = scene(3, task="arch", terms=("pass",), length=60, time_limit=60)
-    return write_scenes(folder, [*three_balls(), arch]).root
+    arch = make_episode(3, task="arch", terms=("pass",), length=60, time_limit=60)
+    return write_episodes(folder, [*three_balls(), arch]).root
 
 
 def test_the_assessment_does_not_change_the_exit_code(
@@ -91,7 +91,7 @@ def test_a_missing_matplotlib_is_reported_before_reading(
 
 
 def test_a_missing_column_is_named(tmp_path: Path) -> None:
-    reader = write_scenes(tmp_path / "one", [scene(0, length=4, time_limit=4)])
+    reader = write_episodes(tmp_path / "one", [make_episode(0, length=4, time_limit=4)])
     path = reader.data_path(0)
     pq.write_table(pq.read_table(path, partitioning=None).drop_columns(["action"]), path)
     with pytest.raises(DataError, match="column action is missing"):
@@ -128,7 +128,7 @@ EASY = CoverageLimits(
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> DatasetStatistics:
     root = tmp_path_factory.mktemp("data") / "three"
-    return compute_statistics(write_scenes(root, three_balls()), ReturnConfig())
+    return compute_statistics(write_episodes(root, three_balls()), ReturnConfig())
 
 
 def failed(found: DatasetStatistics, limits: CoverageLimits = EASY, **changes: object) -> list[str]:

@@ -12,7 +12,7 @@ from egovcp.data.committer import work_folder
 from egovcp.testing import random_episode
 from egovcp_collect.dataset.cli import main
 from tests.support.hub import FakeHub
-from tests.support.hub.faults import Trouble
+from tests.support.hub.faults import HubFaultKind
 
 REPO = "datasets/me/six"
 QUICK = ("--network.attempts=2", "--network.wait_s=0.01", "--network.timeout_s=20")
@@ -80,7 +80,7 @@ def test_pushing_again_completes_the_tag_only(hub: FakeHub, root: Path) -> None:
     hub.fail("tag", 503)
     assert push(root) == 5
     head = hub.store.refs(REPO).branches["main"]
-    hub.heal()
+    hub.reset()
     assert push(root, "--tag=first") == 0
     assert hub.store.refs(REPO).tags == {"v3.0": head, "first": head}
     assert push(root) == 0
@@ -147,19 +147,19 @@ def test_a_link_is_not_followed(
 @pytest.mark.parametrize("command", ["info", "coverage"])
 def test_a_revision_is_resolved_once(hub: FakeHub, root: Path, command: str) -> None:
     assert push(root) == 0
-    hub.heal()
+    hub.reset()
     assert main([command, "me/six"]) == 0
     assert hub.requests["info"] == 1
 
 
 def test_a_failed_pull_continues(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     assert push(root) == 0
-    hub.heal()
+    hub.reset()
     hub.fail("resolve", 503, after=4)
     assert pull(tmp_path / "copy") == 5
     assert not (tmp_path / "copy").exists()
     done = hub.requests["resolve"]
-    hub.heal()
+    hub.reset()
     assert pull(tmp_path / "copy") == 0
     files = set(hub.store.commit(REPO, "main").files) - {".gitattributes"}
     assert hub.requests["resolve"] == len(files) - 4 < done + len(files)
@@ -197,7 +197,7 @@ def test_a_damaged_dataset_on_the_hub_does_not_appear(
     assert not list(tmp_path.glob("*copy*"))
 
 
-@pytest.mark.parametrize("trouble", [401, 404, 503, "reset", "lose"])
+@pytest.mark.parametrize("kind", [401, 404, 503, "reset", "lose"])
 @pytest.mark.parametrize("command", ["push", "pull"])
 def test_the_token_is_never_shown(
     hub: FakeHub,
@@ -207,21 +207,21 @@ def test_the_token_is_never_shown(
     capfd: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     command: str,
-    trouble: Trouble,
+    kind: HubFaultKind,
 ) -> None:
     monkeypatch.setenv("HF_TOKEN", TOKEN)
     caplog.set_level("DEBUG")
     if command == "pull":
         assert push(root) == 0
-    hub.fail("commit" if command == "push" else "resolve", trouble)
+    hub.fail("commit" if command == "push" else "resolve", kind)
     run = push if command == "push" else pull
     code = run(root if command == "push" else tmp_path / "copy", "--debug")
-    assert code in ({0, 5} if trouble == "lose" else {3 if trouble == 404 else 5})
+    assert code in ({0, 5} if kind == "lose" else {3 if kind == 404 else 5})
     shown = capfd.readouterr()
     assert TOKEN not in shown.out + shown.err + caplog.text
     if code:
         assert shown.err.splitlines()[-1].startswith(f"egovcp-dataset {command}: error: ")
-    hub.heal()
+    hub.reset()
     shutil.rmtree(tmp_path / "hub")
     written = b"".join(p.read_bytes() for p in tmp_path.rglob("*") if p.is_file())
     assert TOKEN.encode() not in written

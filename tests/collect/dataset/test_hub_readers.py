@@ -1,10 +1,13 @@
 """LeRobot, `datasets` and egovcp read a pushed dataset and return the same frames."""
 
+import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from datasets import load_dataset
+from lerobot.datasets import dataset_metadata, streaming_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 
@@ -12,7 +15,7 @@ from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
 from egovcp.testing import random_episode
 from egovcp_collect.dataset.cli import main
-from tests.support.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, redirect_hub
 
 #: (index, sum of the state, sum of the depth in mm).
 type Row = tuple[int, float, float]
@@ -25,7 +28,7 @@ def commit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with DatasetWriter(folder / "six", Provenance("stance-1"), shard_episodes=2) as writer:
         for number in range(3):
             writer.add(random_episode(number))
-    with FakeHub(folder / "hub") as hub, in_this_process(hub.endpoint, folder / "home"):
+    with FakeHub(folder / "hub") as hub, redirect_hub(hub.endpoint, folder / "home"):
         assert main(["push", str(folder / "six"), "--repo_id=me/six"]) == 0
         yield hub.store.refs("datasets/me/six").tags["v3.0"]
 
@@ -62,6 +65,11 @@ def _egovcp(commit: str) -> list[Row]:
     return [
         (int(i), float(s.sum()), float(d.sum())) for i, s, d in zip(*columns.values(), strict=True)
     ]
+
+
+def test_lerobot_looks_for_local_datasets_in_the_redirected_home(commit: str) -> None:
+    home = Path(os.environ["HF_LEROBOT_HOME"])
+    assert dataset_metadata.HF_LEROBOT_HOME == streaming_dataset.HF_LEROBOT_HOME == home
 
 
 @pytest.mark.parametrize("read", [_lerobot, _lerobot_stream, _datasets_stream, _egovcp])

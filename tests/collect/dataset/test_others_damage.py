@@ -87,10 +87,10 @@ DAMAGE: dict[str, tuple[str, d.Damage, str, int | None, str]] = {
     "episode twice": ("arm", of_table(episode_index=item(2, 1)), d.EPISODES, 1, "listed in row 2"),
     "rows of another episode": (
         "arm", rows_of(d.DATA, episode_index=lambda v: v.__setitem__(slice(8, 20), [0] * 12)),
-        d.DATA, 0, "of another episode",
+        d.DATA, 1, "column episode_index is 0, expected 1",
     ),
     "null episode number": (
-        "arm", rows_of(d.DATA, episode_index=item(9, None)), d.DATA, 1, "has a null value",
+        "arm", rows_of(d.DATA, episode_index=item(9, None)), d.DATA, 1, "episode_index is null",
     ),
     "time goes back": (
         "arm", rows_of(d.DATA, timestamp=item(12, 0.1)), d.DATA, 1, "timestamps must increase",
@@ -172,13 +172,15 @@ def test_what_is_not_checked_is_unknown_after_the_last_problem(
     assert "stopped" not in capsys.readouterr().out
 
 
-def damage_row_group(path: Path, edges: Sequence[int], statistics: bool = True) -> None:
-    """Write row groups with these edges, and damage the second."""
+def damage_row_group(
+    path: Path, edges: Sequence[int], statistics: bool = True, key: str = "action"
+) -> None:
+    """Write row groups with these edges, and damage a column of the second."""
     table = pq.read_table(path)
     with pq.ParquetWriter(path, table.schema, write_statistics=statistics) as writer:
         for first, last in itertools.pairwise(edges):
             writer.write_table(table.slice(first, last - first))
-    column = pq.read_metadata(path).row_group(1).column(0)
+    column = pq.read_metadata(path).row_group(1).column(table.column_names.index(key))
     content = bytearray(path.read_bytes())
     start = column.dictionary_page_offset or column.data_page_offset
     content[start : start + 8] = b"\xff" * 8
@@ -197,16 +199,70 @@ def test_an_episode_is_read_beside_a_damaged_one(
         reader.read(reader.rows[1], ["action"])
 
 
+@pytest.mark.parametrize("key", ["action", "episode_index"])
 @pytest.mark.parametrize("edges", [(0, 30, 70, 72), (0, 30, 50, 72), (0, 40, 70, 72)])
 def test_a_damaged_row_group_is_a_problem_of_its_episode_only(
-    edges: Sequence[int], others: dict[str, Path], tmp_path: Path
+    edges: Sequence[int], key: str, others: dict[str, Path], tmp_path: Path
 ) -> None:
     """Episode 1 has rows 30 to 69."""
     root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
-    damage_row_group(root / d.DATA, edges)
+    damage_row_group(root / d.DATA, edges, key=key)
     (error,) = lerobot_problems(root)
     assert error.episode == 1
     assert "damaged" in error.problem
+
+
+def rename(rows: list[object]) -> None:
+    """Give all rows of episode 1 the number of another."""
+    rows[:] = [3 if number == 1 else number for number in rows]
+
+
+@pytest.mark.parametrize(
+    ("damage", "episode", "frame", "text"),
+    [
+        (d.column("episode_index", d.put(35, 9)), 1, 5, "is 9, expected 1"),
+        (d.column("episode_index", d.put(30, 0)), 1, 0, "is 0, expected 1"),
+        (d.column("episode_index", d.put(69, 2)), 1, 39, "is 2, expected 1"),
+        (d.column("episode_index", d.put(35, None)), 1, 5, "is null"),
+        (d.column("episode_index", rename), 1, 0, "is 3, expected 1"),
+        (d.rows(lambda table: table.drop_columns(["episode_index"])), 0, None, "lacks the column"),
+        (of_table(episode_index=item(1, 0)), 0, None, "listed in row 1"),
+        (of_table(episode_index=item(1, 2)), 2, None, "listed in row 1"),
+        (of_table(episode_index=item(1, 9)), 9, None, "listed in row 1"),
+        (of_table(episode_index=item(1, None)), None, None, "is null in row 1"),
+        (
+            d.rows(lambda table: table.drop_columns(["episode_index"]), d.EPISODES),
+            None, None, "is missing",
+        ),
+    ],
+)  # fmt: skip
+def test_a_damaged_episode_index_is_one_problem(
+    damage: d.Damage, episode: int | None, frame: int | None, text: str,
+    others: dict[str, Path], tmp_path: Path,
+) -> None:  # fmt: skip
+    """Episode 1 has rows 30 to 69."""
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    damage(root)
+    (error,) = lerobot_problems(root)
+    assert (error.episode, error.frame) == (episode, frame)
+    assert text in error.problem
+
+
+@pytest.mark.parametrize(
+    ("damage", "problems"),
+    [
+        (d.rows(lambda table: table.drop_columns(["episode_index"])), 1),
+        (d.swap(d.DATA, d.MORE_DATA), 2),
+    ],
+)
+def test_a_damaged_file_is_no_problem_of_the_files_after_it(
+    damage: d.Damage, problems: int, others: dict[str, Path], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(others["chunks"], tmp_path / "copy"))
+    damage(root)
+    found = list(lerobot_problems(root))
+    assert len(found) == problems
+    assert {error.episode for error in found} <= {0, 1}
 
 
 def test_statistics_of_booleans_may_be_booleans(others: dict[str, Path], tmp_path: Path) -> None:

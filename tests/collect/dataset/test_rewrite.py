@@ -18,7 +18,7 @@ from egovcp_collect.dataset.cli import main
 from . import damage as d
 from .conftest import COLLECTED, walk, write
 from .damage import COLLECTION, DATA, EPISODES, INFO, MORE_DATA, STATS, TASKS
-from .scenes import ARM
+from .episodes import ARM
 
 pytestmark = pytest.mark.usefixtures("no_network")
 

@@ -20,7 +20,7 @@ from egovcp_collect.dataset.statistics import (
 )
 from egovcp_collect.dataset.task_data import read_rows, sample_episodes
 
-from .scenes import LENGTH, scene, three_balls, write_scenes
+from .episodes import LENGTH, make_episode, three_balls, write_episodes
 
 RETURNS = ReturnConfig(steps=10)
 
@@ -29,8 +29,8 @@ RETURNS = ReturnConfig(steps=10)
 def reader(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
     """Three balls and, between them, an arch."""
     first, *others = three_balls()
-    arch = scene(3, {5: -0.1}, task="arch", terms=("hit",), length=30, time_limit=30)
-    return write_scenes(tmp_path_factory.mktemp("data") / "mixed", [first, arch, *others])
+    arch = make_episode(3, {5: -0.1}, task="arch", terms=("hit",), length=30, time_limit=30)
+    return write_episodes(tmp_path_factory.mktemp("data") / "mixed", [first, arch, *others])
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +69,8 @@ def test_events_ahead_come_from_recorded_terms_not_from_action_costs(tmp_path: P
     terms[20, REWARD_TERMS.index("action_rate")] = -0.1
     terms[40, REWARD_TERMS.index("hit")] = -1.0
     terms[60, REWARD_TERMS.index("block")] = 1.0
-    costs = replace(scene(0), reward=terms.sum(axis=1), reward_terms=terms)
-    (rows,) = read_rows(write_scenes(tmp_path / "terms", [costs]), RETURNS)
+    costs = replace(make_episode(0), reward=terms.sum(axis=1), reward_terms=terms)
+    (rows,) = read_rows(write_episodes(tmp_path / "terms", [costs]), RETURNS)
     success, failure = events_ahead(rows, RETURNS.steps)
     assert np.flatnonzero(success).tolist() == [*range(51, 61)]
     assert np.flatnonzero(failure).tolist() == [*range(31, 41)]
@@ -94,10 +94,12 @@ def test_event_episodes_are_counted_by_column_not_by_the_name_of_the_term(tmp_pa
     terms[:, 40, REWARD_TERMS.index("pose")] = -0.01
     metadata = {"seed": 5, "episode": 0, "reward_terms": {"stop": {"sum": 1.0, "ticks": 1}}}
     episodes = [
-        replace(scene(i), reward=t.sum(axis=1), reward_terms=t, task="bag", metadata=metadata)
+        replace(
+            make_episode(i), reward=t.sum(axis=1), reward_terms=t, task="bag", metadata=metadata
+        )
         for i, t in enumerate(terms)
     ]
-    (bag,) = compute_statistics(write_scenes(tmp_path / "bag", episodes), RETURNS).tasks
+    (bag,) = compute_statistics(write_episodes(tmp_path / "bag", episodes), RETURNS).tasks
     assert (bag.event_episodes, bag.success_event_episodes, bag.failure_event_episodes) == (1, 1, 0)
     assert bag.has_success_events
     assert _event_colour("stop", bag.term_rates["stop"]) == _SUCCESS
@@ -107,9 +109,9 @@ def test_events_of_an_episode_without_terms_are_changes_of_the_reward(tmp_path: 
     terms = np.zeros((2, LENGTH, len(REWARD_TERMS)), np.float32)
     terms[0, 20, REWARD_TERMS.index("block")] = 1.0
     terms[1, 30, REWARD_TERMS.index("hit")] = -1.0
-    recorded, older = (replace(scene(i), reward=t.sum(axis=1)) for i, t in enumerate(terms))
+    recorded, older = (replace(make_episode(i), reward=t.sum(axis=1)) for i, t in enumerate(terms))
     episodes = [replace(recorded, reward_terms=terms[0]), older]
-    found = compute_statistics(write_scenes(tmp_path / "mixed", episodes), RETURNS)
+    found = compute_statistics(write_episodes(tmp_path / "mixed", episodes), RETURNS)
     (task,), (rows,) = found.tasks, found.rows
     assert (task.success_event_episodes, task.failure_event_episodes) == (1, 1)
     success, failure = (np.flatnonzero(event) for event in events_ahead(rows, 1))
@@ -120,7 +122,9 @@ def test_events_of_an_episode_without_terms_are_changes_of_the_reward(tmp_path: 
 def test_tasks_whose_reward_has_costs_only_have_no_success_events(
     task: str, expected: bool, tmp_path: Path
 ) -> None:
-    reader = write_scenes(tmp_path / task, [scene(0, {40: -1.0}, task=task, terms=("hit",))])
+    reader = write_episodes(
+        tmp_path / task, [make_episode(0, {40: -1.0}, task=task, terms=("hit",))]
+    )
     assert compute_statistics(reader, RETURNS).tasks[0].has_success_events == expected
 
 
@@ -154,17 +158,17 @@ def test_depth_shares_count_pixels(found: DatasetStatistics) -> None:
 
 
 def test_empty_frames_are_counted(tmp_path: Path) -> None:
-    episode = scene(0, length=4, time_limit=4)
+    episode = make_episode(0, length=4, time_limit=4)
     episode.depth[1:] = 0
-    found = compute_statistics(write_scenes(tmp_path / "blind", [episode]), RETURNS)
+    found = compute_statistics(write_episodes(tmp_path / "blind", [episode]), RETURNS)
     assert found.tasks[0].depth.empty_share == pytest.approx(3 / 4)
 
 
 def test_a_sample_has_twelve_episodes_and_shows_frames_from_the_event_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    episodes = [scene(i, length=30, time_limit=30) for i in range(20)]
-    reader = write_scenes(tmp_path / "many", episodes)
+    episodes = [make_episode(i, length=30, time_limit=30) for i in range(20)]
+    reader = write_episodes(tmp_path / "many", episodes)
     (rows,) = read_rows(reader, RETURNS)
     read: list[int] = []
     original = DatasetReader.read

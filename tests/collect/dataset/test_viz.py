@@ -21,12 +21,12 @@ from egovcp_collect.dataset.viz import write_recording
 from tests.support.hub import FakeHub
 
 from .conftest import write
-from .scenes import ARM, SETTINGS, scene, three_balls, write_scenes
+from .episodes import ARM, SETTINGS, make_episode, three_balls, write_episodes
 
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
-    return write_scenes(tmp_path_factory.mktemp("data") / "three", three_balls())
+    return write_episodes(tmp_path_factory.mktemp("data") / "three", three_balls())
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_a_missing_episode_is_a_usage_error(
 def test_spawn_opens_a_viewer_that_only_this_machine_can_reach(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reader = write_scenes(tmp_path / "one", [scene(0, length=3, time_limit=3)])
+    reader = write_episodes(tmp_path / "one", [make_episode(0, length=3, time_limit=3)])
     started: list[list[str]] = []
     monkeypatch.setattr(viz.subprocess, "Popen", lambda args, **options: started.append(args))
     output = tmp_path / "a.rrd"

@@ -10,7 +10,7 @@ from egovcp.errors import ArtifactError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, publish
 from egovcp.manifest import MANIFEST, sealed
 from tests.support.hub import FakeHub
-from tests.support.hub.faults import Trouble
+from tests.support.hub.faults import HubFaultKind
 
 from .conftest import FILES, QUICK
 
@@ -22,7 +22,7 @@ def commit(hub: FakeHub, original: Path) -> str:
     extra = {"README.md": Content(b"---\nlicense: mit\n---\n"), "modeling.py": Content(b"raise")}
     publication = Publication("me/policy", contents | extra, "a policy", repo_type="model")
     made = publish(publication, QUICK).commit
-    hub.heal()
+    hub.reset()
     return made
 
 
@@ -58,7 +58,7 @@ def test_a_hub_id_is_fetched_at_its_revision(hub: FakeHub, original: Path, commi
     pinned = load_artifact("me/policy", commit)
     assert pinned.controller_id == "stance-1"
     assert pinned.path.name == commit
-    hub.heal()
+    hub.reset()
     load_artifact("me/policy", commit)
     assert not hub.requests, "a commit that is here cannot have changed"
 
@@ -86,18 +86,18 @@ def test_an_unknown_hub_id_is_an_artifact_error(
         load_artifact(name, revision, QUICK)
 
 
-@pytest.mark.parametrize("trouble", [403, 429, 503, "reset"])
+@pytest.mark.parametrize("kind", [403, 429, 503, "reset"])
 def test_hub_errors_are_retried_and_then_reported(
-    hub: FakeHub, commit: str, trouble: Trouble
+    hub: FakeHub, commit: str, kind: HubFaultKind
 ) -> None:
-    hub.fail("*", trouble, retry_after=0 if trouble == 429 else None)
+    hub.fail("*", kind, retry_after=0 if kind == 429 else None)
     with pytest.raises(EnvironmentFailure) as caught:
         load_artifact("me/policy", "", QUICK)
     assert "\n" not in str(caught.value)
-    assert sum(hub.requests.values()) == (1 if trouble == 403 else QUICK.attempts)
-    hub.heal()
-    hub.fail("*", trouble, times=1, retry_after=0 if trouble == 429 else None)
-    if trouble != 403:
+    assert sum(hub.requests.values()) == (1 if kind == 403 else QUICK.attempts)
+    hub.reset()
+    hub.fail("*", kind, times=1, retry_after=0 if kind == 429 else None)
+    if kind != 403:
         assert load_artifact("me/policy", "", QUICK).path.name == commit
 
 

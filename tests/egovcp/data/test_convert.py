@@ -53,6 +53,13 @@ def _converted(theirs: Path, root: Path, episodes: str = "", **features: str) ->
     return open_dataset(root)
 
 
+@pytest.fixture
+def without_videos(tmp_path: Path) -> Path:
+    features = {k: v for k, v in FEATURES.items() if v["dtype"] != "video"}
+    options = {"fps": 10, "use_videos": False}
+    return write_features(tmp_path / "a", features, LENGTHS, ("x",), options)
+
+
 def test_numbers_are_those_that_lerobot_reads(
     theirs: Path, frames: list[Mapping[str, Any]], tmp_path: Path
 ) -> None:
@@ -159,11 +166,8 @@ def test_own_datasets_are_not_converted(theirs: Path, tmp_path: Path) -> None:
         _converted(own.root, tmp_path / "again", image="observation.depth")
 
 
-def test_damage_is_named_and_nothing_is_left(tmp_path: Path) -> None:
-    features = {k: v for k, v in FEATURES.items() if v["dtype"] != "video"}
-    options = {"fps": 10, "use_videos": False}
-    root = write_features(tmp_path / "a", features, LENGTHS, ("x",), options)
-    path = next((root / "data").rglob("*.parquet"))
+def test_damage_is_named_and_nothing_is_left(without_videos: Path, tmp_path: Path) -> None:
+    path = next((without_videos / "data").rglob("*.parquet"))
     table = pq.read_table(path)
     states = table["observation.state"].to_pylist()
     states[9] = [0.0, float("nan"), 0.0]
@@ -172,15 +176,13 @@ def test_damage_is_named_and_nothing_is_left(tmp_path: Path) -> None:
     changed = table.set_column(column, field, pa.array(states, field.type))
     pq.write_table(changed, path)
     with pytest.raises(DataError, match=r"episode 1, frame 2: observation.state is not finite"):
-        _converted(root, tmp_path / "own")
+        _converted(without_videos, tmp_path / "own")
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
 @pytest.mark.parametrize("key", ["next.reward", "timestamp", "task_index"])
-def test_a_missing_column_is_named(key: str, tmp_path: Path) -> None:
-    features = {k: v for k, v in FEATURES.items() if v["dtype"] != "video"}
-    options = {"fps": 10, "use_videos": False}
-    root = write_features(tmp_path / "a", features, LENGTHS, ("x",), options)
+def test_a_missing_column_is_named(key: str, without_videos: Path, tmp_path: Path) -> None:
+    root = without_videos
     path = next((root / "data").rglob("*.parquet"))
     pq.write_table(pq.read_table(path).drop_columns([key]), path)
     with pytest.raises(DataError, match=f"parquet, episode 0: column {key} is missing"):

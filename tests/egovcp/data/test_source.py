@@ -13,7 +13,7 @@ from egovcp.data.source import select_episodes
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from tests.support.hub import FakeHub
-from tests.support.hub.faults import Trouble
+from tests.support.hub.faults import HubFaultKind
 from tests.support.ports import reserved_port
 
 QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
@@ -26,7 +26,7 @@ def commit(hub: FakeHub, dataset_root: Path) -> str:
     files = [path for path in dataset_root.rglob("*") if path.is_file()]
     contents = {path.relative_to(dataset_root).as_posix(): Content(path) for path in files}
     made = publish(Publication("me/six", contents, "six episodes"), QUICK).commit
-    hub.heal()
+    hub.reset()
     return made
 
 
@@ -36,7 +36,7 @@ def test_a_hub_dataset_is_fetched_and_its_commit_recorded(
     fetched = DatasetReader.open(SIX)
     assert fetched.source.commit == commit
     np.testing.assert_array_equal(fetched.read(4).depth, reader.read(4).depth)
-    hub.heal()
+    hub.reset()
     pinned = DatasetReader.open(DatasetConfig(repo_id="me/six", revision=commit))
     assert pinned.root == fetched.root
     assert not hub.requests, "a commit that is here cannot have changed"
@@ -67,15 +67,15 @@ def test_a_local_folder_does_not_contact_the_hub(
 
 
 @pytest.mark.parametrize("route", ["info", "tree", "metadata", "resolve"])
-@pytest.mark.parametrize("trouble", [401, 503, "reset"])
+@pytest.mark.parametrize("kind", [401, 503, "reset"])
 def test_a_hub_that_fails_is_an_environment_failure(
-    hub: FakeHub, commit: str, route: str, trouble: Trouble
+    hub: FakeHub, commit: str, route: str, kind: HubFaultKind
 ) -> None:
-    hub.fail(route, trouble)
+    hub.fail(route, kind)
     with pytest.raises(EnvironmentFailure, match=r"hf auth login|cannot be used") as caught:
         source.locate(SIX, QUICK)
     assert "\n" not in str(caught.value)
-    hub.heal()
+    hub.reset()
     assert source.locate(SIX, QUICK).commit == commit
 
 

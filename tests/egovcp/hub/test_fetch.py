@@ -16,18 +16,18 @@ from egovcp.hub import (
     resolve,
 )
 from tests.support.hub import FakeHub
-from tests.support.hub.faults import Trouble
+from tests.support.hub.faults import HubFaultKind
 
 HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)
 ROUTES = ("info", "tree", "metadata", "resolve")
-TROUBLES: tuple[Trouble, ...] = (401, 404, 503, "reset", "truncate")
+FAULT_KINDS: tuple[HubFaultKind, ...] = (401, 404, 503, "reset", "truncate")
 
 
 @pytest.fixture
 def commit(hub: FakeHub, publication: Publication) -> str:
     """The publication is on the Hub."""
     made = publish(publication, HEALTHY).commit
-    hub.heal()
+    hub.reset()
     return made
 
 
@@ -50,7 +50,7 @@ def require_same(folder: Path, publication: Publication) -> None:
 
 
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("trouble", TROUBLES)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_lasting_fault_is_reported_and_the_next_fetch_succeeds(
     hub: FakeHub,
     publication: Publication,
@@ -58,34 +58,34 @@ def test_a_lasting_fault_is_reported_and_the_next_fetch_succeeds(
     quick: RetryPolicy,
     tmp_path: Path,
     route: str,
-    trouble: Trouble,
+    kind: HubFaultKind,
 ) -> None:
-    hub.fail(route, trouble)
+    hub.fail(route, kind)
     error = pull(tmp_path / "folder", quick)
-    if (route, trouble) == ("metadata", "truncate"):
+    if (route, kind) == ("metadata", "truncate"):
         assert error is None, "an answer without a body has nothing to truncate"
     else:
-        assert isinstance(error, DataError if trouble == 404 else EnvironmentFailure)
+        assert isinstance(error, DataError if kind == 404 else EnvironmentFailure)
         assert "\n" not in str(error)
-        if trouble == 401:
+        if kind == 401:
             assert "hf auth login" in str(error)
             assert "read access to me/small" in str(error)
-    hub.heal()
+    hub.reset()
     assert pull(tmp_path / "folder", HEALTHY) is None
     require_same(tmp_path / "folder", publication)
 
 
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("trouble", [503, "reset", "truncate"])
+@pytest.mark.parametrize("kind", [503, "reset", "truncate"])
 def test_a_transient_fault_is_retried(
     hub: FakeHub,
     publication: Publication,
     commit: str,
     tmp_path: Path,
     route: str,
-    trouble: Trouble,
+    kind: HubFaultKind,
 ) -> None:
-    hub.fail(route, trouble, times=1)
+    hub.fail(route, kind, times=1)
     assert pull(tmp_path / "folder", HEALTHY) is None
     require_same(tmp_path / "folder", publication)
 
@@ -104,7 +104,7 @@ def test_downloaded_files_are_not_fetched_again(
 ) -> None:
     hub.fail("resolve", 503, after=2)
     assert pull(tmp_path / "folder", quick) is not None
-    hub.heal()
+    hub.reset()
     assert pull(tmp_path / "folder", HEALTHY) is None
     assert hub.requests["resolve"] == len(publication.contents) - 2
 

@@ -35,7 +35,7 @@ def test_get_downloads_a_file_once(
     assert cache.has("meta/info.json")
     assert not cache.has(DATA)
     assert cache.get(DATA).read_bytes() == publication.contents[DATA].source
-    hub.heal()
+    hub.reset()
     cache.get(DATA)
     assert not hub.requests
 
@@ -58,7 +58,7 @@ def test_a_file_that_is_being_prefetched_is_requested_once(
         download(self, name)
 
     monkeypatch.setattr(HubFileCache, "_download", slow)
-    hub.heal()
+    hub.reset()
     cache.prefetch([DATA])
     assert begun.wait(20)
     cache.prefetch([DATA])
@@ -74,7 +74,7 @@ def test_get_retries_a_failed_prefetch(cache: HubFileCache, hub: FakeHub) -> Non
     assert not cache.has(DATA)
     with pytest.raises(EnvironmentFailure, match="503"):
         cache.get(DATA)
-    hub.heal()
+    hub.reset()
     assert cache.get(DATA).exists()
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, LostUpdate, Publication, RetryPolicy, ensure_repository, publish
-from tests.support.hub import FakeHub, in_this_process
-from tests.support.hub.faults import Trouble
+from tests.support.hub import FakeHub, redirect_hub
+from tests.support.hub.faults import HubFaultKind
 
 REPO = "datasets/me/small"
 HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)
@@ -32,7 +32,7 @@ REFUSALS = {
     403: "no permission.*write access",
     404: "no dataset me/small",
 }
-TROUBLES: tuple[Trouble, ...] = (401, 404, 503, "reset", "lose", "truncate")
+FAULT_KINDS: tuple[HubFaultKind, ...] = (401, 404, 503, "reset", "lose", "truncate")
 
 
 def outcome(publication: Publication, retry: RetryPolicy) -> str | EgovcpError:
@@ -59,21 +59,21 @@ def require_published(hub: FakeHub, publication: Publication, commit: str) -> No
 
 
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("trouble", TROUBLES)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_a_lasting_fault_is_reported_and_publishes_all_or_nothing(
-    hub: FakeHub, publication: Publication, quick: RetryPolicy, route: str, trouble: Trouble
+    hub: FakeHub, publication: Publication, quick: RetryPolicy, route: str, kind: HubFaultKind
 ) -> None:
-    hub.fail(route, trouble)
+    hub.fail(route, kind)
     found = outcome(publication, quick)
     if isinstance(found, str):  # the work was done; only the answer was lost, or it was verified
-        assert trouble in ("lose", "truncate") or route == "lfs_verify"
+        assert kind in ("lose", "truncate") or route == "lfs_verify"
         require_published(hub, publication, found)
     else:
-        assert isinstance(found, DataError if trouble == 404 else EnvironmentFailure)
+        assert isinstance(found, DataError if kind == 404 else EnvironmentFailure)
         assert "\n" not in str(found)
     require_whole_or_nothing(hub, publication)
     assert hub.requests[route] <= 2 * quick.attempts
-    hub.heal()
+    hub.reset()
     require_published(hub, publication, publish(publication, HEALTHY).commit)
 
 
@@ -95,11 +95,11 @@ def test_a_refusal_names_the_remedy(
 
 
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("trouble", [503, "reset", "lose"])
+@pytest.mark.parametrize("kind", [503, "reset", "lose"])
 def test_a_transient_fault_is_retried(
-    hub: FakeHub, publication: Publication, route: str, trouble: Trouble
+    hub: FakeHub, publication: Publication, route: str, kind: HubFaultKind
 ) -> None:
-    hub.fail(route, trouble, times=1)
+    hub.fail(route, kind, times=1)
     require_published(hub, publication, publish(publication, HEALTHY).commit)
 
 
@@ -112,14 +112,14 @@ def test_a_silent_hub_times_out(hub: FakeHub, publication: Publication, route: s
     else:
         assert isinstance(found, EnvironmentFailure)
         assert "ReadTimeout" in str(found)
-    hub.heal()
+    hub.reset()
     require_published(hub, publication, publish(publication, HEALTHY).commit)
 
 
 def test_unchanged_content_is_not_sent_again(hub: FakeHub, publication: Publication) -> None:
     first = publish(publication, HEALTHY)
     assert first.new
-    hub.heal()
+    hub.reset()
     again = publish(publication, HEALTHY)
     assert again.commit == first.commit
     assert not again.new
@@ -254,7 +254,7 @@ def test_ensure_repository_needs_a_token(
 def test_a_token_without_write_access_is_refused(tmp_path: Path, quick: RetryPolicy) -> None:
     with (
         FakeHub(tmp_path / "hub", token="hf_other") as hub,
-        in_this_process(hub.endpoint, tmp_path / "home"),
+        redirect_hub(hub.endpoint, tmp_path / "home"),
         pytest.raises(EnvironmentFailure, match="write access to models of me"),
     ):
         ensure_repository(POLICY, quick)

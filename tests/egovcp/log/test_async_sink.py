@@ -21,7 +21,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import RunInfo
 from egovcp.log.writer_process import Outbox
-from tests.support.sinks import FaultySink
+from tests.support.sinks import BrokenSink, FaultySink
 
 INFO = RunInfo("ball")
 type Start = Callable[..., AsyncSink]
@@ -150,6 +150,14 @@ def test_a_full_disk_is_reported_once(
     sink.close()
     assert sink.dropped + sink.lost == 4
     assert len(warnings) == 2
+
+
+def test_an_error_that_cannot_be_unpickled_is_reported_as_text(
+    start: Start, make_tick: Any, warnings: list[str]
+) -> None:
+    sink = start(BrokenSink())
+    until(lambda: sink.write(make_tick(0, bare=True)) or sink.failure)
+    assert warnings == ["the log: LibraryError: it broke; the run continues without this log"]
 
 
 def test_a_killed_writer_is_reported_once(

@@ -63,19 +63,19 @@ def test_each_image_of_a_batch_is_treated_alone() -> None:
     assert torch.equal(both[1:], nearness(two, MAX_M))
 
 
-def test_what_is_out_of_range_is_nothing() -> None:
+def test_depth_beyond_the_range_has_nearness_0() -> None:
     far = torch.full(SHAPE, round(1000 * MAX_M) + 500, dtype=torch.int32)
     assert nearness(far, MAX_M).max() == 0
     assert network_image(nearness(far, MAX_M)).max() == 0
 
 
-def test_metres_undo_nearness() -> None:
+def test_to_metres_inverts_nearness() -> None:
     wall = torch.full(SHAPE, 1234, dtype=torch.int32)
     torch.testing.assert_close(to_metres(nearness(wall, MAX_M), MAX_M), wall / 1000)
     assert to_metres(torch.zeros(SHAPE), MAX_M).max() == 0
 
 
-def test_the_network_sees_what_is_measured_and_that_it_is() -> None:
+def test_network_image_has_nearness_and_validity_channels() -> None:
     depth = torch.zeros(SHAPE, dtype=torch.int32)
     depth[0, 5:9, 5:9] = 3000
     near, valid = network_image(nearness(depth, MAX_M))[0]

@@ -33,7 +33,7 @@ from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 
 needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
-EXACT, BYTES = 1e-5, 0.1  # largest error, in deviations of J
+EXACT, BYTES = 1e-5, 0.1  # largest error, in deviations of V
 TOLERANCES = [
     ("float32", EXACT),
     pytest.param("int8", BYTES, marks=needs_compiler),

@@ -3,8 +3,9 @@
 import os
 import pwd
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -20,7 +21,7 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become 
 OTHER_USER = 12345
 
 
-def _forget() -> None:
+def _clear_caches() -> None:
     for cached in (library.library, library.library_if_possible, library.warn_float32):
         cached.cache_clear()
 
@@ -31,14 +32,14 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(library, "processor_is_fast", lambda: True)
     monkeypatch.setattr(library, "FLAGS", ("-O0", "-shared", "-fPIC", "-std=gnu11"))
-    _forget()
+    _clear_caches()
     yield tmp_path / "cache" / "egovcp"
-    _forget()
+    _clear_caches()
 
 
 def _evaluator(backend: BackendName) -> object:
     """What computes the plans in a process that has just started."""
-    _forget()
+    _clear_caches()
     return make_evaluator(toy_model(), PlannerConfig(backend=backend))
 
 
@@ -48,27 +49,19 @@ def _compiled(cache: Path) -> Path:
 
 
 @pytest.fixture
-def compilations(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """One entry for each run of the compiler."""
-    runs: list[Path] = []
-    run = subprocess.run
-
-    def record(*args: object, **options: object) -> object:
-        runs.append(Path())
-        return run(*args, **options)  # type: ignore[call-overload]
-
-    monkeypatch.setattr(subprocess, "run", record)
-    return runs
+def compilations(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Counts the runs of the compiler."""
+    run = Mock(wraps=subprocess.run)
+    monkeypatch.setattr(subprocess, "run", run)
+    return run
 
 
 # --- the cache ----------------------------------------------------------------------------
 @needs_compiler
-def test_the_kernel_is_compiled_once_into_a_private_folder(
-    cache: Path, compilations: list[Path]
-) -> None:
+def test_the_kernel_is_compiled_once_into_a_private_folder(cache: Path, compilations: Mock) -> None:
     for _ in range(2):
         assert isinstance(_evaluator("int8"), Int8Evaluator)
-    assert len(compilations) == 1
+    assert compilations.call_count == 1
     assert cache.stat().st_mode & 0o777 == cache.parent.stat().st_mode & 0o777 == 0o700
     digest = f"{_compiled(cache)}.sha256"
     subprocess.run(["sha256sum", "--check", "--quiet", digest], cwd=cache, check=True)
@@ -76,13 +69,13 @@ def test_the_kernel_is_compiled_once_into_a_private_folder(
 
 
 @needs_compiler
-def test_a_truncated_library_is_compiled_again(cache: Path, compilations: list[Path]) -> None:
+def test_a_truncated_library_is_compiled_again(cache: Path, compilations: Mock) -> None:
     _evaluator("int8")
     for size in (0, 5000):
         with _compiled(cache).open("r+b") as file:
             file.truncate(size)
         assert isinstance(_evaluator("int8"), Int8Evaluator)
-    assert len(compilations) == 3
+    assert compilations.call_count == 3
     assert _compiled(cache).stat().st_size > 5000
 
 
@@ -136,15 +129,14 @@ def _foreign(cache: Path) -> None:
     ],
 )
 def test_a_library_planted_by_another_user_is_not_executed(
-    open_up: object,
+    open_up: Callable[[Path], None],
     reason: str,
     cache: Path,
     planted: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert callable(open_up)
     open_up(cache)
-    _forget()
+    _clear_caches()
     for _ in range(2):
         assert isinstance(make_evaluator(toy_model(), PlannerConfig()), FloatEvaluator)
     message = capsys.readouterr().err

@@ -32,7 +32,7 @@ ALIVE = [0.0, 0.0, 0.0, 0.0]
 def _value(
     deaths: list[float], horizon: int = 4, values: list[float] = VALUES, **config: Any
 ) -> float:
-    """J of a plan in the scripted world, with gamma 0.5 and a smallest return of -10."""
+    """V of a plan in the scripted world, with gamma 0.5 and a smallest return of -10."""
     world = ScriptedWorld(values, deaths, -10.0, REWARDS, 0.5)
     planner = plain_planner(horizon=horizon, **config)
     actions = torch.zeros(1, 1, planner.actions, spec.ACTION_DIM)
@@ -141,7 +141,7 @@ def _plans(robots: int, plans: int, length: int) -> Tensor:
 
 
 def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfig) -> float:
-    """J of one plan (A, 7) of one robot, one number at a time."""
+    """V of one plan (A, 7) of one robot, one number at a time."""
     n, gamma = config.horizon, float(model.discount)
     floor = 0.0 if config.termination_rule == "paper" else float(model.min_return)
     total, share = 0.0, 1.0

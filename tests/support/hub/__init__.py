@@ -7,8 +7,8 @@ disk, counts requests and fails on demand (`FakeHub.fail`). On the command line:
     python -m tests.support.hub --root DIR --port 8080
 """
 
-from tests.support.hub.environment import client_factory, environment, in_this_process
+from tests.support.hub.environment import client_factory, hub_environment, redirect_hub
 from tests.support.hub.faults import Fault
 from tests.support.hub.server import FakeHub
 
-__all__ = ["FakeHub", "Fault", "client_factory", "environment", "in_this_process"]
+__all__ = ["FakeHub", "Fault", "client_factory", "hub_environment", "redirect_hub"]

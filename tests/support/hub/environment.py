@@ -11,7 +11,7 @@ from typing import Any
 from unittest import mock
 
 
-def environment(endpoint: str, home: Path) -> dict[str, str]:
+def hub_environment(endpoint: str, home: Path) -> dict[str, str]:
     """Variables for a process that is to talk to the Hub at ``endpoint``.
 
     ``home`` takes every cache, so that nothing of the user's is read or written. They must
@@ -33,7 +33,7 @@ def environment(endpoint: str, home: Path) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
+def redirect_hub(endpoint: str, home: Path) -> Iterator[None]:
     """Redirect this process, whose libraries have read their variables already.
 
     Replaces the constants of `huggingface_hub`, and of `datasets` and `lerobot` if they
@@ -43,7 +43,7 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
     import huggingface_hub
     from huggingface_hub import constants, file_download
 
-    variables = environment(endpoint, home)
+    variables = hub_environment(endpoint, home)
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.dict("os.environ", variables))
         for name, value in {
@@ -56,15 +56,15 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
             "HF_HUB_OFFLINE": False,
         }.items():
             stack.enter_context(mock.patch.object(constants, name, value))
-        impatient = mock.Mock(wraps=time, sleep=lambda seconds: None)
-        stack.enter_context(mock.patch.object(file_download, "time", impatient))
+        no_sleep = mock.Mock(wraps=time, sleep=lambda seconds: None)
+        stack.enter_context(mock.patch.object(file_download, "time", no_sleep))
         if (config := sys.modules.get("datasets.config")) is not None:
             stack.enter_context(mock.patch.object(config, "HF_ENDPOINT", endpoint))
-        cache = Path(variables["HF_LEROBOT_HOME"]) / "hub"
-        for name in [name for name in sys.modules if name.startswith("lerobot.datasets.")]:
-            if hasattr(sys.modules[name], "HF_LEROBOT_HUB_CACHE"):
-                patch = mock.patch.object(sys.modules[name], "HF_LEROBOT_HUB_CACHE", cache)
-                stack.enter_context(patch)
+        lerobot = Path(variables["HF_LEROBOT_HOME"])
+        places = {"HF_LEROBOT_HOME": lerobot, "HF_LEROBOT_HUB_CACHE": lerobot / "hub"}
+        for module in [m for n, m in sys.modules.items() if n.startswith("lerobot.datasets.")]:
+            for name in places.keys() & vars(module).keys():
+                stack.enter_context(mock.patch.object(module, name, places[name]))
         huggingface_hub.HfFileSystem.clear_instance_cache()
         try:
             yield

@@ -1,4 +1,4 @@
-"""What goes wrong on the way to the Hub, on demand."""
+"""Fault injection for the fake Hub."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Literal
 
-type Trouble = int | Literal["reset", "stall", "truncate", "lose"]
+type HubFaultKind = int | Literal["reset", "stall", "truncate", "lose"]
 """What to do to a request: respond with that HTTP status, or
 
 - ``reset``: break the connection instead of responding,
@@ -17,27 +17,27 @@ type Trouble = int | Literal["reset", "stall", "truncate", "lose"]
 - ``lose``: do what was asked, then break the connection.
 """
 
-EVER = 10**9
+ALWAYS = 10**9
 
 
 @dataclass
 class Fault:
-    """Trouble for the next requests of a route."""
+    """A fault of the next requests of a route."""
 
     route: str
     """Name of the route (see `tests.support.hub.routes.ROUTES`); ``*``: any."""
-    trouble: Trouble
-    times: int = EVER
-    """How many requests it befalls."""
+    kind: HubFaultKind
+    times: int = ALWAYS
+    """Number of requests that it applies to."""
     after: int = 0
-    """How many requests it spares first."""
+    """Number of requests that it skips first."""
     retry_after: int | None = None
     """Seconds of the ``Retry-After`` header of a status; None: no such header."""
     message: str = ""
     """The error message of the response."""
 
 
-class Faults:
+class HubFaults:
     """The faults still to come, and the count of requests per route."""
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Faults:
         self._lock = threading.Lock()
 
     def add(self, fault: Fault) -> None:
-        """Append a fault; the first one that fits a request befalls it."""
+        """Append a fault; the first one that fits a request applies to it."""
         with self._lock:
             self._pending.append(fault)
 
@@ -57,7 +57,7 @@ class Faults:
             self.requests.clear()
 
     def take(self, route: str) -> Fault | None:
-        """Count a request; return the fault that befalls it."""
+        """Count a request; return the fault that applies to it."""
         with self._lock:
             self.requests[route] += 1
             for fault in self._pending:

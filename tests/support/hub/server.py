@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from tests.support.hub.faults import EVER, Fault, Faults, Trouble
+from tests.support.hub.faults import ALWAYS, Fault, HubFaultKind, HubFaults
 from tests.support.hub.messages import Request, Response, arriving, json_response
 from tests.support.hub.routes import ROUTES, Route
 from tests.support.hub.store import HttpError, Store
@@ -37,7 +37,7 @@ class FakeHub:
         """Open the folder and the port; ``token``: needed to write and to read private data."""
         self.store = Store(Path(root))
         self.token = token
-        self.faults = Faults()
+        self.faults = HubFaults()
         self.closing = threading.Event()
         self._server = _Server(("127.0.0.1", port), partial(_Handler, hub=self))
 
@@ -54,16 +54,16 @@ class FakeHub:
     def fail(
         self,
         route: str,
-        trouble: Trouble,
-        times: int = EVER,
+        kind: HubFaultKind,
+        times: int = ALWAYS,
         after: int = 0,
         retry_after: int | None = None,
         message: str = "",
     ) -> None:
         """Order a fault; see `Fault`."""
-        self.faults.add(Fault(route, trouble, times, after, retry_after, message))
+        self.faults.add(Fault(route, kind, times, after, retry_after, message))
 
-    def heal(self) -> None:
+    def reset(self) -> None:
         """Forget all faults and counts."""
         self.faults.clear()
 
@@ -124,26 +124,26 @@ class _Handler(BaseHTTPRequestHandler):
             body=arriving(self.rfile, headers),  # type: ignore[arg-type]
         )
         fault = self.hub.faults.take(route.name if route else "unknown")
-        trouble = fault.trouble if fault else None
-        if trouble == "reset":
+        kind = fault.kind if fault else None
+        if kind == "reset":
             return self._break()
-        if fault is not None and isinstance(trouble, int):
+        if fault is not None and isinstance(kind, int):
             response = _error_response(
-                HttpError(trouble, fault.message or "as ordered"), fault.retry_after
+                HttpError(kind, fault.message or "as ordered"), fault.retry_after
             )
         else:
             response = self._respond(route, request)
         for _ in request.body:  # what no route has read: the connection is used again
             pass
-        half = trouble in ("stall", "truncate")
-        if trouble == "truncate" and self.command == "HEAD":
+        half = kind in ("stall", "truncate")
+        if kind == "truncate" and self.command == "HEAD":
             half = False  # complete without a body: the client uses the connection again
         empty = response.size == 0 or self.command == "HEAD"
-        if trouble == "stall" and empty:
+        if kind == "stall" and empty:
             self.hub.closing.wait(_STALL_S)
-        if trouble == "lose" or (half and empty):
+        if kind == "lose" or (half and empty):
             return self._break()
-        return self._send(response, half, stall=trouble == "stall")
+        return self._send(response, half, stall=kind == "stall")
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = _handle  # noqa: N815
 

@@ -27,7 +27,8 @@ class Mutation:
 
     name: str
     culprit: str | None
-    """The file that the refusal must name; None: the policy loads; `ANY_FILE`: either."""
+    """Files, separated by ``|``, one of which the refusal must name; None: the policy loads;
+    `ANY_FILE`: either."""
 
 
 def mutate_policy(folder: Path, seed: int) -> Mutation:

@@ -6,21 +6,21 @@ import hashlib
 import io
 import json
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from safetensors.torch import load, save
 
 from egovcp.artifact import CONFIG, WEIGHTS
 from egovcp.manifest import MANIFEST, PROCESSORS, sealed
+from tests.support.file_mutations import Random
 
 type Json = dict[str, Any]
-type Random = np.random.Generator
 type Mutate = Callable[[Path, Random], str | None]
-"""Changes a policy folder; returns the file at fault, or None if the policy must still load."""
+"""Changes a policy folder; returns the files, separated by ``|``, one of which must be named, or
+None if the policy must still load."""
 
 MARKER: Final = "EXECUTED"
 """A file of this name appears in the policy folder if code of the policy is executed."""
@@ -35,30 +35,6 @@ def renew_digests(folder: Path) -> None:
     for name in manifest["files"]:
         manifest["files"][name] = hashlib.sha256((folder / name).read_bytes()).hexdigest()
     (folder / MANIFEST).write_text(json.dumps(sealed(manifest)))
-
-
-def pick[T](rng: Random, choices: Sequence[T]) -> T:
-    """One of them."""
-    return choices[int(rng.integers(len(choices)))]
-
-
-def flip_bits(path: Path, rng: Random, most: int) -> None:
-    """Flip up to ``most`` bits of a file."""
-    content = bytearray(path.read_bytes())
-    for at in rng.integers(len(content), size=int(rng.integers(1, most + 1))):
-        content[at] ^= 1 << int(rng.integers(8))
-    path.write_bytes(content)
-
-
-def wrong_encodings(text: str) -> list[bytes]:
-    """JSON that is not UTF-8, or not JSON at all."""
-    return [
-        text.encode("utf-16"),
-        text.encode().replace(b"e", b"\xff", 1),
-        text.replace("{", '{"\\ud800": 1,', 1).encode(),
-        text.encode() + b"\0",
-        b"",
-    ]
 
 
 def edit_json(folder: Path, name: str, change: Callable[[Json], object]) -> str:

@@ -14,13 +14,12 @@ from safetensors.torch import load, save
 
 from egovcp.artifact import CONFIG, FILES, WEIGHTS
 from egovcp.manifest import MANIFEST, PROCESSORS, SEAL
+from tests.support.file_mutations import Random, pick
 from tests.support.policy_mutations.editing import (
     MARKER,
     Json,
     Mutate,
-    Random,
     edit_json,
-    pick,
     pickled,
     renew_digests,
     write_json,

@@ -8,16 +8,14 @@ from typing import Any, Final
 
 from egovcp.artifact import CONFIG, WEIGHTS
 from egovcp.manifest import PROCESSORS
+from tests.support.file_mutations import Random, json_mutations, pick
 from tests.support.policy_mutations.editing import (
     JSON_FILES,
     MARKER,
     Json,
     Mutate,
-    Random,
     edit_json,
-    pick,
     write_json,
-    wrong_encodings,
 )
 
 
@@ -105,47 +103,9 @@ def _drop_or_add_an_option(folder: Path, rng: Random) -> str:
     return edit_json(folder, CONFIG, change)
 
 
-def _write_a_constant_that_is_no_json(folder: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    text = (folder / name).read_text()
-    constant = pick(rng, ["NaN", "Infinity", "-Infinity", "1e999", "-1e400"])
-    write_json(folder, name, text.replace("{", f'{{"extra": {constant},', 1))
-    return str(name)
-
-
-def _nest_json(folder: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    depth = int(rng.integers(1000, 1_000_000))
-    opening, closing = pick(rng, [("[", "]"), ('{"a":', "}")])
-    nested = opening * depth + "1" + closing * depth
-    text = (folder / name).read_text()
-    write_json(folder, name, text.replace("{", f'{{"extra": {nested},', 1))
-    return str(name)
-
-
 def _make_json_huge(folder: Path, rng: Random) -> str:
     name = pick(rng, JSON_FILES)
     os.truncate(folder / name, 200 << 20)
-    return str(name)
-
-
-def _write_many_values(folder: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    text = (folder / name).read_text()
-    values = ",".join(["[]"] * 2_000_000)
-    write_json(folder, name, text.replace("{", f'{{"extra": [{values}],', 1))
-    return str(name)
-
-
-def _write_json_in_another_encoding(folder: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    write_json(folder, name, pick(rng, wrong_encodings((folder / name).read_text())))
-    return str(name)
-
-
-def _write_something_else_than_an_object(folder: Path, rng: Random) -> str:
-    name = pick(rng, JSON_FILES)
-    write_json(folder, name, pick(rng, ["[]", "3", "null", '"text"', "true", "{}", "[{}]"]))
     return str(name)
 
 
@@ -168,11 +128,7 @@ TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
     _give_a_size_another_number,
     _ask_for_a_huge_plan,
     _drop_or_add_an_option,
-    _write_a_constant_that_is_no_json,
-    _nest_json,
     _make_json_huge,
-    _write_many_values,
-    _write_json_in_another_encoding,
-    _write_something_else_than_an_object,
     _name_a_class_to_import,
+    *json_mutations(JSON_FILES, lambda folder, name, text, rng: write_json(folder, name, text)),
 )

@@ -10,15 +10,13 @@ import numpy as np
 import torch
 
 from egovcp.artifact import FILES, WEIGHTS
+from tests.support.file_mutations import Random, flip_bits, pick
 from tests.support.policy_mutations.editing import (
     ANY_FILE,
     Json,
     Mutate,
-    Random,
     edit_header,
     edit_tensors,
-    flip_bits,
-    pick,
     pickled,
     renew_digests,
 )

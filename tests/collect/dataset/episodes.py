@@ -34,7 +34,7 @@ ARM = RobotSpec(
 )
 
 
-def scene(
+def make_episode(
     number: int,
     rewards: Mapping[int, float] = {},
     task: str = "ball",
@@ -71,7 +71,7 @@ def scene(
     )
 
 
-def write_scenes(root: Path, episodes: Sequence[Episode]) -> DatasetReader:
+def write_episodes(root: Path, episodes: Sequence[Episode]) -> DatasetReader:
     """A dataset of these episodes."""
     with DatasetWriter(root, SETTINGS) as writer:
         for episode in episodes:
@@ -82,7 +82,9 @@ def write_scenes(root: Path, episodes: Sequence[Episode]) -> DatasetReader:
 def three_balls() -> list[Episode]:
     """One blocked, one that hits and fells the robot, one that misses."""
     return [
-        scene(0, {60: 1.0}, terms=("block",), contact_ticks={"hands": 3}, scene={"radius": 0.1}),
-        scene(1, {40: -1.0}, terms=("hit", "fall"), length=41, scene={"radius": 0.12}),
-        scene(2, scene={"radius": 0.11}),
+        make_episode(
+            0, {60: 1.0}, terms=("block",), contact_ticks={"hands": 3}, scene={"radius": 0.1}
+        ),
+        make_episode(1, {40: -1.0}, terms=("hit", "fall"), length=41, scene={"radius": 0.12}),
+        make_episode(2, scene={"radius": 0.11}),
     ]
