@@ -52,7 +52,7 @@ class DeployConfig:
     sequence (several in one episode, --env.sequence.parts), or package.module:Class; of a real
     robot only recorded. It is no input of the policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
-    """Number of rollouts in simulation; a unitree_g1 makes one."""
+    """Rollouts in simulation, or recordings to replay; a unitree_g1 makes one."""
     seed: int = bounded(0, least=0, below=SEEDS)
     """Which held-out scenarios; on a unitree_g1, seed of the planner."""
     output_dir: str = ""

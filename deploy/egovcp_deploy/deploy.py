@@ -75,6 +75,11 @@ def check_options(config: DeployConfig) -> None:
         require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
         find_task(config.task, "--task")
     if robot == "unitree_g1" and config.robot.camera.type == "realsense":
-        require_realsense()
+        require_realsense(config.robot.camera.realsense)
+    if config.operator.type == "keyboard" and config.operator.duration:
+        raise UsageError(
+            f"--operator.duration={config.operator.duration:g} needs --operator.type=remote or "
+            "auto; with keyboard, press h to hold the robot, and q to damp it and quit"
+        )
     if config.output_dir or not config.dry_run:  # a dry run writes nothing
         check_output_dir(config.output_dir)

@@ -54,25 +54,34 @@ class EpisodeGroup:
 
 
 class EpisodePlayer:
-    """Plays groups in this process; groups of equal size share environment and policy."""
+    """Plays groups in this process, until ``stopped()`` turns true; groups of equal size share
+    environment and policy."""
 
-    def __init__(self, config: EvalConfig, artifact: Artifact | None = None) -> None:
-        self._config = config
-        self._artifact = artifact
+    def __init__(
+        self,
+        config: EvalConfig,
+        artifact: Artifact | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._config, self._artifact, self._stopped = config, artifact, stopped
         self._envs: dict[int, BaseVectorEnv] = {}
         self._policies: dict[tuple[str, int], RolloutPolicy] = {}
 
-    def play(
-        self, group: EpisodeGroup, stopped: Callable[[], bool] = lambda: False
-    ) -> list[EpisodeScore]:
-        """Scores in the order of the group's scenarios; see `play`."""
-        if stopped():
+    def play(self, group: EpisodeGroup) -> list[EpisodeScore]:
+        """Scores in the order of the group's scenarios; see `play_group`."""
+        if self._stopped():
             return []
         size, task = len(group.scenarios), group.scenarios[0].task
         if size not in self._envs:
             self._envs[size] = make_env(self._config.env, size, [task])
         env = self._envs[size]
-        return play(env, self._policy(group, env), group.scenarios, stopped, group.videos)
+        policy = self._policy(group, env)
+        return play_group(env, policy, group.scenarios, self._stopped, group.videos)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for env in self._envs.values():
+            env.close()
 
     def _policy(self, group: EpisodeGroup, env: BaseVectorEnv) -> RolloutPolicy:
         config, robots = self._config, env.num_envs
@@ -94,7 +103,7 @@ class EpisodePlayer:
         return self._policies[key]
 
 
-def play(
+def play_group(
     env: BaseVectorEnv,
     policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
@@ -125,9 +134,10 @@ def play(
         plan_ms.append((time.perf_counter() - begin) * 1e3 / num_envs)
         if step.skipped.size:
             skipped += live & step.skipped
+        sent = safety.filter(step.action)
         if live[: len(sinks)].any():
-            _draw(sinks, len(plan_ms) - 1, env, observation, policy, step)
-        result = env.step(safety.filter(step.action))
+            _draw(sinks, len(plan_ms) - 1, env, observation, policy, step, sent)
+        result = env.step(sent)
         policy.advance(result.sent_action)
         rewards += np.where(live, result.reward, 0.0)
         steps += live
@@ -159,6 +169,7 @@ def _draw(
     observation: Observation,
     policy: RolloutPolicy,
     step: PolicyStep,
+    sent: NDArray[np.floating],
 ) -> None:
     """Add tick ``index`` of the first instances, with what the model imagines, to their ``sinks``;
     call it before ``env`` advances."""
@@ -174,7 +185,7 @@ def _draw(
                 depth=observation.depth[i].copy(),
                 state=observation.state[i].copy(),
                 action_planned=step.action[i],
-                action_sent=step.action[i],  # before the safety filter; `PictureSink` ignores it
+                action_sent=sent[i],
                 base=base,
                 scene=scene,
                 depth_imagined=None if imagined is None else imagined[i],
@@ -196,7 +207,7 @@ class EpisodePool:
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self._workers = config.num_workers or available_cores()
-        self._player = EpisodePlayer(config, artifact)
+        self._player = EpisodePlayer(config, artifact, stopped)
         self._stopped = stopped
         context = multiprocessing.get_context("spawn")
         self._stop = context.Event()
@@ -210,11 +221,14 @@ class EpisodePool:
         killed."""
         if self._workers == 1:
             for i, group in enumerate(groups):
-                yield i, self._player.play(group, self._stopped)
+                yield i, self._player.play(group)
             return
         try:
             with inherited_by_workers():
-                index = {self._executor.submit(_play, group): i for i, group in enumerate(groups)}
+                index = {
+                    self._executor.submit(_play_in_worker, group): i
+                    for i, group in enumerate(groups)
+                }
             waiting = set(index)
             while waiting:
                 if self._stopped() and not self._stop.is_set():
@@ -229,20 +243,20 @@ class EpisodePool:
             ) from error
 
     def close(self) -> None:
-        """Abandon episodes in progress and end the workers."""
+        """Abandon episodes in progress, end the workers and close the environments."""
         self._stop.set()
         self._executor.shutdown(wait=True, cancel_futures=True)
+        self._player.close()
 
 
-class _Worker:  # the state of a worker process
-    player: EpisodePlayer
-    stop: Event
+_player: EpisodePlayer  # of a worker process
 
 
 def _start(config: EvalConfig, stop: Event) -> None:
+    global _player
     torch.set_num_threads(1)
-    _Worker.player, _Worker.stop = EpisodePlayer(config), stop
+    _player = EpisodePlayer(config, stopped=stop.is_set)
 
 
-def _play(group: EpisodeGroup) -> list[EpisodeScore]:
-    return _Worker.player.play(group, _Worker.stop.is_set)
+def _play_in_worker(group: EpisodeGroup) -> list[EpisodeScore]:
+    return _player.play(group)

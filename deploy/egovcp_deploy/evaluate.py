@@ -69,7 +69,7 @@ class ConstantOptions:
     """The reference `constant`."""
 
     path: str = ""
-    """constant.json of an earlier evaluation; empty: search the best action."""
+    """constant.json of an earlier evaluation; empty: search for the best action."""
 
 
 @dataclass(frozen=True)

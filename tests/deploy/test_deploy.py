@@ -123,6 +123,16 @@ def test_a_recording_has_the_format_of_the_data(
         (["--seed=-1"], 2, "--seed=-1"),
         (["--planner.samples=2"], 2, "elites"),
         (["--output_dir="], 2, "--output_dir"),
+        (["--operator.type=keyboard", "--operator.duration=3"], 2, "press h to hold the robot"),
+        (
+            [
+                "--robot.type=unitree_g1",
+                "--policy.path=/nowhere",
+                "--robot.camera.type=realsense",
+            ],
+            2,
+            "lists as --robot.camera.realsense.serial",
+        ),
     ],
 )
 def test_bad_input_ends_with_one_line_before_any_work(

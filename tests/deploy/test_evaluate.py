@@ -331,7 +331,7 @@ def test_recorded_paths_are_absolute(
 
 def _interrupt_at_group(monkeypatch: pytest.MonkeyPatch, number: int, signals: int = 1) -> None:
     """Send this process SIGINT when that group of episodes begins."""
-    original, groups = episodes.play, itertools.count(1)
+    original, groups = episodes.play_group, itertools.count(1)
 
     def play(*args: Any) -> list[EpisodeScore]:
         if next(groups) == number:
@@ -339,7 +339,7 @@ def _interrupt_at_group(monkeypatch: pytest.MonkeyPatch, number: int, signals: i
                 signal.raise_signal(signal.SIGINT)
         return original(*args)
 
-    monkeypatch.setattr(episodes, "play", play)
+    monkeypatch.setattr(episodes, "play_group", play)
 
 
 @pytest.mark.parametrize("signals", [1, 2])
@@ -380,14 +380,14 @@ def test_an_evaluation_interrupted_at_its_start_writes_no_figures(
 def test_an_error_keeps_complete_episodes(
     tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original, groups = episodes.play, itertools.count(1)
+    original, groups = episodes.play_group, itertools.count(1)
 
     def play(*args: Any) -> list[EpisodeScore]:
         if next(groups) == 2:
             raise SimulationDiverged("the simulation diverged")
         return original(*args)
 
-    monkeypatch.setattr(episodes, "play", play)
+    monkeypatch.setattr(episodes, "play_group", play)
     out = tmp_path / "out"
     assert run(out, "--controllers=hold", "--episodes=4", "--num_envs=2", *short) == 3
     row = json.loads((out / "eval.json").read_text())["ball"]["hold"]
@@ -405,8 +405,21 @@ def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfi
         advance(sent)
 
     toppled.advance = push  # type: ignore[method-assign]
-    (score,) = episodes.play(env, toppled, scenarios, lambda: next(ticks) > 30)
+    (score,) = episodes.play_group(env, toppled, scenarios, lambda: next(ticks) > 30)
     assert (score.episode, score.terminated) == (1, True)
+
+
+def test_a_closed_pool_has_closed_its_environments(
+    config: EnvConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[VectorEnv] = []
+    monkeypatch.setattr(VectorEnv, "close", lambda env: closed.append(env))
+    with closing(EpisodePool(EvalConfig(env=config, num_workers=1))) as pool:
+        for count in (1, 2):
+            scenarios = tuple(Scenario("ball", 0, number) for number in range(count))
+            list(pool.play([EpisodeGroup("hold", scenarios)] * 2))
+        assert not closed
+    assert [env.num_envs for env in closed] == [1, 2]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Output folders and result files: nothing overwritten, nothing half written."""
+"""Output folders, options of the planner, seeds, and scenes of a played episode."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
 from egovcp.policy_options import PlannerOptions
 from egovcp.sim.config import evaluation_config
-from egovcp.sim.scenario import HELD_OUT, SEARCH
+from egovcp.sim.scenario import HELD_OUT, SEARCH, require_training_seed
 from egovcp.sim.tasks import task_names
 from egovcp_deploy.evaluate import EvalConfig
-from egovcp_deploy.options import check_output_dir, held_out, make_output_dir
+from egovcp_deploy.options import SEEDS, check_output_dir, held_out, make_output_dir
 
 
 def test_an_empty_folder_is_accepted_and_a_new_one_created(tmp_path: Path) -> None:
@@ -62,8 +62,11 @@ def test_planner_options_change_only_what_they_name() -> None:
 
 
 def test_scenario_seeds_of_collection_evaluation_and_search_are_disjoint() -> None:
-    seeds = {held_out("ball", seed, 0).seed for seed in (0, 1, 10**8)}
+    seeds = {held_out("ball", seed, 0).seed for seed in (0, 1, SEEDS - 1)}
     assert all(HELD_OUT <= seed < SEARCH for seed in seeds)
+    require_training_seed(HELD_OUT - 1)
+    with pytest.raises(UsageError, match="for evaluation"):
+        require_training_seed(HELD_OUT)
     for bad in (-1, 10**9):
         with pytest.raises(UsageError, match="--seed"):
             parse_config(EvalConfig, [f"--seed={bad}"], "egovcp-eval")

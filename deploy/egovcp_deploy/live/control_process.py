@@ -27,7 +27,7 @@ from egovcp.workers import stop_on_signal
 from egovcp_deploy.live.control import ControlLoop, damping_command
 from egovcp_deploy.live.hardware import Hardware, RobotOptions, open_hardware
 from egovcp_deploy.live.link import Link, RemotePlanner
-from egovcp_deploy.live.operators import RemoteOperator
+from egovcp_deploy.live.operators import RemoteControlInput
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.bridge import BridgeRobot
@@ -98,7 +98,7 @@ class ControlProcess:
             Pilot(self._planner, options.limits),
             hardware.link,
         )
-        self._remote = RemoteOperator()
+        self._remote = RemoteControlInput()
         self._orphaned = 0
 
     def add_event(self, event: str) -> None:

@@ -46,7 +46,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
     controller_id = make_controller(robot.controller).id
     artifact.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
-    stays = config.operator.type == "keyboard" or not config.operator.duration
+    stays = not config.operator.duration
     leave_core()
     policy = artifact.make_policy(1, config.seed)
     runner = PlannerRunner(policy, config.imagine)

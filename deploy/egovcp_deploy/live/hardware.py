@@ -32,13 +32,13 @@ class RobotOptions:
 
     type: Literal["sim", "unitree_g1", "replay"] = "sim"
     """sim: the simulated G1, in lock-step with the planner; unitree_g1: a G1, or egovcp-fake-g1,
-    behind LeRobot's bridge, on the wall clock; replay: recorded observations, from which the policy
-    plans again, and nothing is driven."""
+    behind LeRobot's bridge, on the wall clock; replay: replan on recorded observations; no robot
+    moves."""
     recordings: str = ""
     """For replay: an MCAP file, or a folder of them."""
     controller: str = "walk"
     """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; it must be
-    that of the policy's data. The simulated robot uses --env.controller."""
+    that of the policy's data; the simulated robot uses --env.controller."""
     bridge: BridgeConfig = field(default_factory=BridgeConfig)
     """Address of the bridge of a unitree_g1."""
     camera: CameraOptions = field(default_factory=CameraOptions)

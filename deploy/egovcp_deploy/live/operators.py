@@ -4,6 +4,7 @@ changes and the base velocity."""
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 import termios
@@ -110,7 +111,12 @@ _KEYBOARD_HELP: Final = (
 )
 
 
-class Keyboard:
+#: What a terminal sends for a key with Alt, an arrow or a function key. It ends before a space, so
+#: that no emergency stop is lost.
+_ESCAPE_SEQUENCE: Final = re.compile(r"\x1b+(\[+|O)?[\d;]*[^ ]?")
+
+
+class KeyboardOperator:
     """Keys of the terminal. The robot stops walking when this process ends."""
 
     def __init__(self) -> None:
@@ -119,11 +125,12 @@ class Keyboard:
 
     def commands(self, now_ns: int, mode: str, failed: bool = False) -> list[OperatorCommand]:
         """One command per key, and the velocity ten times a second."""
-        commands = []
+        commands, typed = [], b""
         while select.select([sys.stdin], [], [], 0.0)[0]:
-            key = os.read(sys.stdin.fileno(), 1).decode(errors="replace")
-            if not key:
+            if not (new := os.read(sys.stdin.fileno(), 4096)):
                 break
+            typed += new
+        for key in _ESCAPE_SEQUENCE.sub("", typed.decode(errors="replace")).lower():
             if key in _KEYS:
                 commands.append(_KEYS[key])
             elif key == "x":
@@ -153,7 +160,7 @@ _BUTTONS: Final = {
 }
 
 
-class RemoteOperator:
+class RemoteControlInput:
     """Sticks of the remote control, with one zero when they come to rest, and its buttons: Y stands
     up, A arms, start runs, B holds, each when it goes down after the first message; L1 and B
     together are the emergency stop, for as long as both are held."""
@@ -182,7 +189,7 @@ class RemoteOperator:
         ]
 
 
-type Operator = TimedOperator | Keyboard
+type Operator = TimedOperator | KeyboardOperator
 
 
 @contextmanager
@@ -198,13 +205,13 @@ def open_operator(options: OperatorOptions) -> Iterator[Operator]:
         return
     if not sys.stdin.isatty():
         raise UsageError(
-            "--operator.type=keyboard needs a terminal, but the input is none; "
+            "--operator.type=keyboard needs a terminal, but stdin is not a terminal; "
             "run it in one, or use the robot's remote control (--operator.type=remote)"
         )
     before = termios.tcgetattr(sys.stdin)
     echo(_KEYBOARD_HELP)
     try:
         tty.setcbreak(sys.stdin)
-        yield Keyboard()
+        yield KeyboardOperator()
     finally:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

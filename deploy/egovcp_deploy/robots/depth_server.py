@@ -93,8 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def serve(config: DepthServerConfig) -> None:
-    """Serve until interrupted; raises `EnvironmentFailure` for a missing driver or camera, or a
-    port in use."""
+    """Serve until interrupted; raises `UsageError` without a serial number, `EnvironmentFailure`
+    for a missing driver or camera, or a port in use."""
     fov = config.camera.vertical_fov
     with (
         closing(RealSenseDepthCamera.connect(config.camera)) as camera,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.bounds import bounded
-from egovcp.errors import EnvironmentFailure
+from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.packages import require_packages
 from egovcp.robot.geometry import focal_length
 from egovcp.sim.config import CameraConfig
@@ -85,7 +85,7 @@ class DepthResampler:
         """(height, width) or (height, width, 1) mm, 0 invalid -> (48, 64) mm, 0 invalid; raises
         `ValueError` for another shape."""
         if depth.shape[:2] != self._shape or depth.size != self._shape[0] * self._shape[1]:
-            raise ValueError(f"a depth image of shape {depth.shape}, expected {self._shape}")
+            raise ValueError(f"depth image has shape {depth.shape}, expected {self._shape}")
         self._flat[:-1] = depth.reshape(-1)
         samples = self._flat[self._index]
         valid = (samples >= _MIN_MM) & (samples <= _MAX_MM)
@@ -107,25 +107,20 @@ class RealSenseDepthCamera:
         if self._resample.coverage < _MIN_COVERAGE:
             raise EnvironmentFailure(
                 f"the camera covers {self._resample.coverage:.0%} of the policy's field of view, "
-                f"expected at least {_MIN_COVERAGE:.0%}; choose a wider mode (width, "
-                "height), or a policy trained with a smaller vertical_fov, and set that"
+                f"expected at least {_MIN_COVERAGE:.0%}; choose a wider mode (width, height), or a "
+                "policy trained with a smaller field of view, and set vertical_fov to that"
             )
         self._raw: NDArray[np.uint16] | None = None
         self._newest: DepthImage | None = None
-        self.arrivals = ArrivalMonitor(numbered=True)  # images between two reads are not lost
+        # Images between two reads are not lost.
+        self.arrivals = ArrivalMonitor(estimate_losses=False)
         """Arrivals of the images that were read."""
 
     @classmethod
     def connect(cls, config: RealSenseConfig) -> Self:
-        """Start the camera; raises `EnvironmentFailure` if its driver is not installed, or there is
-        no such camera."""
-        if not config.serial:
-            raise EnvironmentFailure(
-                "no camera is named: give its serial number, --robot.camera.realsense.serial "
-                "(egovcp-deploy) or --camera.serial (egovcp-depth-server); lerobot-find-cameras "
-                "realsense prints it"
-            )
-        require_realsense()
+        """Start the camera; raises as `require_realsense`, and `EnvironmentFailure` if there is no
+        such camera."""
+        require_realsense(config)
         import pyrealsense2 as rs
         from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
 
@@ -142,8 +137,8 @@ class RealSenseDepthCamera:
             driver.connect()
         except (ConnectionError, RuntimeError, TimeoutError, ValueError) as error:
             raise EnvironmentFailure(
-                f"the camera {config.serial} cannot be used: {error}; see lerobot-find-cameras "
-                "realsense, and its USB 3 cable"
+                f"the camera {config.serial} cannot be used: {error}; run lerobot-find-cameras "
+                "realsense and check the USB 3 cable"
             ) from error
         try:
             require_millimetres(driver.rs_profile)
@@ -154,8 +149,8 @@ class RealSenseDepthCamera:
             raise
 
     def read(self) -> DepthImage | None:
-        """Return the newest image; its time is when the driver received it, else that of
-        this call. None before the first image."""
+        """Return the newest image, stamped with the driver's receive time, or the call time if
+        unknown. None before the first image."""
         if self._driver is None:
             return self._newest
         now_ns = time.monotonic_ns()
@@ -193,6 +188,13 @@ def require_millimetres(profile: Any) -> None:
         )
 
 
-def require_realsense() -> None:
-    """Raise `MissingPackage` if LeRobot's RealSense camera is not installed."""
+def require_realsense(config: RealSenseConfig) -> None:
+    """Raise `UsageError` without a serial number, and `MissingPackage` if LeRobot's RealSense
+    camera is not installed."""
+    if not config.serial:
+        raise UsageError(
+            "the serial number of the RealSense camera is missing; give one that "
+            "lerobot-find-cameras realsense lists as --robot.camera.realsense.serial, or "
+            "egovcp-depth-server --camera.serial"
+        )
     require_packages("egovcp-deploy", "the camera", "lerobot", "pyrealsense2")

@@ -51,11 +51,11 @@ class ArrivalStats:
 
 
 class ArrivalMonitor:
-    """Records arrival times; thread-safe. If messages are ``numbered``, the caller reports all
-    losses through `record_loss`; else they are also estimated from intervals of several medians."""
+    """Records arrival times; thread-safe. Losses are those of `record_loss`, and with
+    ``estimate_losses`` at least as many as intervals of several medians suggest."""
 
-    def __init__(self, numbered: bool = False) -> None:
-        self._numbered = numbered
+    def __init__(self, estimate_losses: bool = True) -> None:
+        self._estimate_losses = estimate_losses
         self._lock = threading.Lock()
         self._times: deque[int] = deque(maxlen=_MAX_ARRIVALS)
         self._losses: deque[tuple[int, int]] = deque(maxlen=_MAX_ARRIVALS)
@@ -85,7 +85,7 @@ class ArrivalMonitor:
             return ArrivalStats(1 / window_s, 0.0, gap, lost / (lost + 1))
         intervals = np.diff(times) / 1e6
         median = np.median(intervals)
-        if not self._numbered:  # unusable messages also leave gaps
+        if self._estimate_losses:  # unusable messages also leave gaps
             lost = max(lost, int(np.rint(intervals / median - 1.0).clip(min=0.0).sum()))
         return ArrivalStats(
             rate_hz=len(times) / window_s,

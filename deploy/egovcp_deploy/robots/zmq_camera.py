@@ -103,7 +103,7 @@ class ZmqDepthCamera:
         self.config = config or ZmqCameraConfig()
         self._malformed = 0  # messages
         self._problem = ""  # of the last one
-        self.arrivals = ArrivalMonitor(numbered=True)
+        self.arrivals = ArrivalMonitor(estimate_losses=False)
         """Arrivals of usable images; missing and unusable ones count as lost, but not those that
         arrived together with a newer one."""
         self._newest: DepthImage | None = None

@@ -31,7 +31,7 @@ from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.live.control_process import ControlProcess, merged
 from egovcp_deploy.live.hardware import CameraOptions, RobotOptions, open_hardware
 from egovcp_deploy.live.link import Link
-from egovcp_deploy.live.operators import AutomaticOperator, RemoteOperator
+from egovcp_deploy.live.operators import AutomaticOperator, RemoteControlInput
 from egovcp_deploy.live.planner_loop import PlannerLoop
 from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.pilot import Pilot
@@ -248,7 +248,7 @@ def test_the_robot_stands_in_each_of_several_episodes(name: str, pause: float) -
     clock, controller = LockstepClock(), make_controller(name)
     planner = InlinePlanner(PlannerRunner(Crouching()))
     loop = ControlLoop(body, body.camera, controller, Pilot(planner, Limits()))
-    operator, remote = AutomaticOperator(), RemoteOperator()
+    operator, remote = AutomaticOperator(), RemoteControlInput()
     seen: set[tuple[Phase, State]] = set()
     for _ in range(2500):
         commands = [

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pty
+import select
 import sys
 
 import numpy as np
@@ -12,8 +14,8 @@ from egovcp_deploy.config import OperatorOptions
 from egovcp_deploy.live.control import VELOCITY_HIGH, VELOCITY_LOW
 from egovcp_deploy.live.operators import (
     AutomaticOperator,
-    Keyboard,
-    RemoteOperator,
+    KeyboardOperator,
+    RemoteControlInput,
     TimedOperator,
     open_operator,
 )
@@ -37,7 +39,7 @@ def pressed(*buttons: str) -> bytes:
 def test_a_button_gives_one_request_when_it_goes_down(
     button: str, request_: OperatorRequest
 ) -> None:
-    remote = RemoteOperator()
+    remote = RemoteControlInput()
     assert remote.commands(pressed(button)) == [], "held since before the program"
     assert remote.commands(pressed()) == []
     assert remote.commands(pressed(button)) == [OperatorCommand(request_)]
@@ -47,9 +49,9 @@ def test_a_button_gives_one_request_when_it_goes_down(
 
 
 def test_l1_and_b_together_are_the_emergency_stop_while_held() -> None:
-    remote = RemoteOperator()
+    remote = RemoteControlInput()
     estop = [OperatorCommand(OperatorRequest.ESTOP)]
-    assert RemoteOperator().commands(pressed("L1", "B")) == estop, "also in the first message"
+    assert RemoteControlInput().commands(pressed("L1", "B")) == estop, "also in the first message"
     assert remote.commands(pressed("L1")) == []
     for _ in range(2):
         assert remote.commands(pressed("L1", "B")) == estop
@@ -57,14 +59,14 @@ def test_l1_and_b_together_are_the_emergency_stop_while_held() -> None:
 
 
 def test_sticks_are_velocities_and_unused_buttons_are_ignored() -> None:
-    remote = RemoteOperator()
+    remote = RemoteControlInput()
     assert remote.commands(pressed("up", "F1")) == []
     (command,) = remote.commands(RemoteControl.from_velocity(np.array(FULL_STICK)).to_bytes())
     assert command.velocity == pytest.approx(FULL_STICK)
 
 
 def test_an_invalid_message_gives_no_command() -> None:
-    assert RemoteOperator().commands(b"") == []
+    assert RemoteControlInput().commands(b"") == []
 
 
 def sticks(*velocity: float) -> bytes:
@@ -72,14 +74,14 @@ def sticks(*velocity: float) -> bytes:
 
 
 def test_released_sticks_give_one_zero_velocity() -> None:
-    remote = RemoteOperator()
+    remote = RemoteControlInput()
     remote.commands(sticks(0.3, 0.0, 0.0))
     assert remote.commands(sticks(0.0, 0.0, 0.0)) == [OperatorCommand(velocity=(0.0, 0.0, 0.0))]
     assert remote.commands(sticks(0.0, 0.0, 0.0)) == []
 
 
 def test_a_stick_near_its_rest_position_gives_no_velocity() -> None:
-    remote, drift = RemoteOperator(), 0.04 * np.array(FULL_STICK)
+    remote, drift = RemoteControlInput(), 0.04 * np.array(FULL_STICK)
     assert remote.commands(sticks(*drift)) == []
     (command,) = remote.commands(sticks(0.3, *drift[1:]))
     assert command.velocity == pytest.approx((0.3, 0.0, 0.0))
@@ -89,7 +91,7 @@ def test_the_velocity_of_the_keyboard_is_bounded(monkeypatch: pytest.MonkeyPatch
     reader, writer = os.pipe()
     with open(reader) as keys:
         monkeypatch.setattr(sys, "stdin", keys)
-        keyboard = Keyboard()
+        keyboard = KeyboardOperator()
         os.write(writer, b"i" * 30 + b"l" * 30)
         (command,) = keyboard.commands(0, State.RUN)
         assert command.velocity == (VELOCITY_HIGH[0], VELOCITY_LOW[1], 0.0)
@@ -97,6 +99,31 @@ def test_the_velocity_of_the_keyboard_is_bounded(monkeypatch: pytest.MonkeyPatch
         (command,) = keyboard.commands(10**9, State.RUN)
         assert command.velocity == pytest.approx((VELOCITY_HIGH[0] - 0.1, VELOCITY_LOW[1], 0.0))
         os.close(writer)
+
+
+@pytest.mark.parametrize(
+    ("typed", "requests"),
+    [
+        (b"sAH", [OperatorRequest.STAND, OperatorRequest.ARM, OperatorRequest.HOLD]),
+        (b"\x1bs\x1bA", []),  # with Alt
+        (b"\x1b[A\x1b\x1b[A\x1b[[A\x1bOA\x1bOR\x1b[1;2S\x1b[15~", []),  # arrows, function keys
+        (b"\x1b[Ah", [OperatorRequest.HOLD]),
+        (b"\x1b \x1b[ ", [OperatorRequest.ESTOP] * 2),
+    ],
+)
+def test_capitals_are_keys_and_escape_sequences_are_not(
+    typed: bytes, requests: list[OperatorRequest], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys, terminal = pty.openpty()
+    with open(terminal) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with open_operator(OperatorOptions("keyboard")) as operator:
+            os.write(keys, typed)
+            assert select.select([stdin], [], [], 10.0)[0]
+            *commands, last = operator.commands(0, State.STAND)
+    os.close(keys)
+    assert [command.request for command in commands] == requests
+    assert last.velocity == (0.0, 0.0, 0.0)
 
 
 def test_the_default_operator_leaves_all_requests_to_the_remote_control(

@@ -265,11 +265,9 @@ def test_a_camera_whose_depth_is_not_in_millimetres_is_refused() -> None:
 def test_a_missing_driver_names_the_extra_to_install() -> None:
     with pytest.raises(EnvironmentFailure, match=r"pyrealsense2.*egovcp-deploy\[realsense\]"):
         RealSenseDepthCamera.connect(RealSenseConfig(serial="0123"))
-    with pytest.raises(EnvironmentFailure, match="lerobot-find-cameras"):
-        RealSenseDepthCamera.connect(RealSenseConfig())
 
 
-class ShownImage:
+class FakeDepthCamera:
     """A depth camera whose image the test sets."""
 
     def __init__(self) -> None:
@@ -295,7 +293,7 @@ def test_an_image_that_arrives_together_with_a_newer_one_is_not_lost() -> None:
 
 
 def test_depth_server_publishes_each_image_once() -> None:
-    shown = ShownImage()
+    shown = FakeDepthCamera()
     server = DepthServer(shown, FOV, "127.0.0.1", 0)
     camera = ZmqDepthCamera(ZmqCameraConfig(port=server.port))
     handle, new = camera._handle, list[bool]()  # whether each message has a new image
@@ -328,7 +326,7 @@ def test_depth_server_publishes_each_image_once() -> None:
 def test_depth_server_warns_of_a_silent_camera_and_then_ends(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    clock, shown = LockstepClock(), ShownImage()
+    clock, shown = LockstepClock(), FakeDepthCamera()
     monkeypatch.setattr(depth_server, "time", SimpleNamespace(monotonic_ns=clock.now_ns))
     with closing(DepthServer(shown, FOV, "127.0.0.1", 0)) as server:
         clock.advance(900_000_000)
@@ -344,5 +342,5 @@ def test_depth_server_warns_of_a_silent_camera_and_then_ends(
 
 
 def test_depth_server_reports_a_missing_serial_number(capsys: pytest.CaptureFixture[str]) -> None:
-    assert serve_depth([]) == 5
-    assert "lerobot-find-cameras" in capsys.readouterr().err
+    assert serve_depth([]) == 2
+    assert "egovcp-depth-server --camera.serial" in capsys.readouterr().err

@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass
-class StandingRobot:
-    """A robot that stands still, with the noise of its sensors."""
+class StandingReadings:
+    """Sensor readings of a robot that stands still, with noise."""
 
     rng: np.random.Generator
     position: Array = field(init=False)
@@ -46,7 +46,7 @@ class StandingRobot:
         return LowState(time_ns, *parts, motors=MotorReadings(self.torque))
 
 
-Change = Callable[[StandingRobot], None]
+Change = Callable[[StandingReadings], None]
 
 
 def problems(change: Change, duration: int = 60, step_ns: int = STEP_NS) -> list[str]:
@@ -54,7 +54,7 @@ def problems(change: Change, duration: int = 60, step_ns: int = STEP_NS) -> list
     rng = np.random.default_rng(0)
     plausibility, found = PlausibilityFilter(), list[str]()
     for k in range(ONSET + duration):
-        reading = StandingRobot(rng)
+        reading = StandingReadings(rng)
         if k >= ONSET:
             change(reading)
         found.append(plausibility.check(reading.at(k * step_ns)))
@@ -66,7 +66,7 @@ def speed(value: float) -> Change:
     return lambda reading: reading.speed.__setitem__(KNEE, value)
 
 
-def all_speeds(reading: StandingRobot) -> None:
+def all_speeds(reading: StandingReadings) -> None:
     reading.speed[:] = 190.0 * (-1.0) ** np.arange(29)
 
 
@@ -82,7 +82,7 @@ def torque(value: float) -> Change:
     return lambda reading: reading.torque.__setitem__(KNEE, value)
 
 
-def rolled(reading: StandingRobot) -> None:
+def rolled(reading: StandingReadings) -> None:
     reading.quaternion = np.array([np.cos(0.4), np.sin(0.4), 0.0, 0.0])
 
 
@@ -142,7 +142,7 @@ def test_only_the_implausible_reading_is_rejected() -> None:
 def test_random_readings_within_bounds_are_rejected() -> None:
     rng = np.random.default_rng(1)
 
-    def wild(reading: StandingRobot) -> None:
+    def wild(reading: StandingReadings) -> None:
         reading.position = rng.uniform(-0.2, 0.2, 29)
         reading.speed = rng.uniform(-1, 1, 29) * VELOCITY_LIMIT
 
@@ -159,7 +159,7 @@ def test_a_position_jump_is_accepted_after_the_damping_limit() -> None:
 def test_a_speed_jump_is_accepted_once_positions_follow() -> None:
     ticks = iter(range(1000))
 
-    def moved(reading: StandingRobot) -> None:
+    def moved(reading: StandingReadings) -> None:
         reading.speed[KNEE] = 25.0
         reading.position[KNEE] += 25.0 * next(ticks) * STEP_NS * 1e-9
 

@@ -118,8 +118,8 @@ def test_a_flood_uses_little_processor_time(
 MS = 1_000_000
 
 
-def filled(times_ms: list[float], numbered: bool = False) -> ArrivalMonitor:
-    arrivals = ArrivalMonitor(numbered)
+def filled(times_ms: list[float], estimate_losses: bool = True) -> ArrivalMonitor:
+    arrivals = ArrivalMonitor(estimate_losses)
     for time_ms in times_ms:
         arrivals.record_arrival(round(time_ms * MS))
     return arrivals
@@ -155,8 +155,8 @@ def test_unusable_messages_are_counted_once() -> None:
     assert arrivals.stats(1000 * MS).lost == pytest.approx(0.1, abs=0.01)
 
 
-def test_losses_of_numbered_messages_are_not_estimated() -> None:
-    arrivals = filled([5.0 * k for k in range(1, 201) if k % 10], numbered=True)
+def test_losses_are_not_estimated_if_the_caller_reports_them() -> None:
+    arrivals = filled([5.0 * k for k in range(1, 201) if k % 10], estimate_losses=False)
     assert arrivals.stats(1000 * MS).lost == 0.0
     arrivals.record_loss(900 * MS, 20)
     assert arrivals.stats(1000 * MS).lost == pytest.approx(20 / 200)
