@@ -19,7 +19,7 @@ from report import parser, publish
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
 
-from tests.support.requirements import installed_with
+from tests.support.requirements import required_distributions
 
 APPLICATIONS = ("egovcp", "egovcp-collect", "egovcp-train", "egovcp-deploy", "egovcp-experiment")
 _TORCH = re.compile(r"torch|triton|(nvidia|cuda)-.+")  # whole names
@@ -36,7 +36,7 @@ def sizes_mb() -> dict[str, object]:
     """Size of every application, with and without torch."""
     metrics: dict[str, object] = {}
     for application in APPLICATIONS:
-        sizes = {name: size_mb(name) for name in installed_with(application)}
+        sizes = {name: size_mb(name) for name in required_distributions(application)}
         without = sum(mb for name, mb in sizes.items() if not _TORCH.fullmatch(name))
         metrics[f"{application}_mb"] = sum(sizes.values())
         metrics[f"{application}_without_torch_mb"] = without

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
 from egovcp.model.latent_state import SHIFT
+from egovcp.model.losses import unbroken
 from egovcp.model.networks import SplitLinear, SplitMlp
 from egovcp_train.config import OptimizerConfig
 
@@ -109,13 +110,6 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
 def mean_where(x: Tensor, mask: Tensor) -> Tensor:
     mask = mask.float()
     return (x * mask).sum() / mask.sum().clamp(min=1)
-
-
-def unbroken(batch: Batch, k: int) -> Tensor:
-    """(B, T - k) whether rows t and t + k are valid rows of one episode."""
-    episode = batch.is_first.long().cumsum(1)
-    last = episode.shape[1] - k
-    return (episode[:, k:] == episode[:, :last]) & batch.valid[:, k:] & batch.valid[:, :last]
 
 
 def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:

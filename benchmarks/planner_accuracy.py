@@ -1,8 +1,8 @@
 """Accuracy of the planner backends on recorded states, with a trained policy.
 
 Every backend plans from states of recorded episodes, with the draws of the step-by-step float32
-reference. Metrics: the change of the first action, in the action box of [-1, 1], and the loss of J
-by the reference, in standard deviations of J among the candidates of a first iteration.
+reference. Metrics: the change of the first action, in normalised units ([-1, 1]), and the loss of V
+by the reference, in standard deviations of V among the candidates of a first iteration.
 `other_draws` are the same metrics of the reference itself with other random draws.
 """
 
@@ -67,7 +67,7 @@ class Trial:
         return torch.cat(parts)
 
     def plan_value(self, plans: Tensor) -> Tensor:
-        """J (S, n) of plans (S, n, N, 7) by the reference."""
+        """V (S, n) of plans (S, n, N, 7) by the reference."""
         parts = []
         for rows in torch.arange(len(plans)).split(BATCH):
             carry = self._carry.map(lambda x, rows=rows: x[rows])
@@ -75,7 +75,7 @@ class Trial:
         return torch.cat(parts)
 
     def spread(self) -> Tensor:
-        """Deviation (S,) of J among plans of the data's own process."""
+        """Deviation (S,) of V among plans of the data's own process."""
         rng = torch.Generator().manual_seed(0)
         steps = 2 * torch.rand(1, 256, self._config.horizon, spec.ACTION_DIM, generator=rng) - 1
         every = steps.expand(len(self._executed), -1, -1, -1)

@@ -25,9 +25,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from report import parser, publish
-from tick_logging import logging_metrics, percentiles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
+
+from tick_logging import logging_metrics, percentiles
 
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy, PolicyStep

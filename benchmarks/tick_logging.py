@@ -20,7 +20,6 @@ import contextlib
 import os
 import queue
 import signal
-import socket
 import tempfile
 import threading
 import time
@@ -37,8 +36,9 @@ from egovcp.log.rerun import RerunSink
 from egovcp.log.tick import Candidates, Fanout, RunInfo, Sink, Tick
 from egovcp.log.viewer import LOOPBACK, LiveRerun, Viewer
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
-from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
+from egovcp.spec import ACTION_DIM, PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
+from tests.support.ports import free_port
 
 _INFO = RunInfo("ball")
 _PAUSE_S = 0.2  # between two cases, to write queued ticks
@@ -126,7 +126,7 @@ def _measure(cases: dict[str, Sink], rounds: int) -> dict[str, _Times]:
                 begin = time.perf_counter()
                 work()
                 planned, cpu = time.perf_counter(), time.thread_time()
-                sink.write(replace(tick, index=index, time_ns=index * 40_000_000))
+                sink.write(replace(tick, index=index, time_ns=round(1e9 * index * PLANNER_DT)))
                 end = time.perf_counter()
                 index += 1
                 spent[name].write_cpu.append(time.thread_time() - cpu)
@@ -139,7 +139,7 @@ def _measure(cases: dict[str, Sink], rounds: int) -> dict[str, _Times]:
 def _planning() -> Callable[[], object]:
     model = toy_model()
     config = PlannerConfig(samples=64, elites=16)
-    carry, executed = model.initial(1), torch.zeros(1, 7)
+    carry, executed = model.initial(1), torch.zeros(1, ACTION_DIM)
     evaluator = ReferenceEvaluator(model, config)
 
     def plan() -> object:
@@ -161,11 +161,11 @@ def _tick() -> Tick:
         time_ns=0,
         depth=(1000 * images[0]).astype(np.uint16),
         state=state,
-        action_planned=np.zeros(7, np.float32),
-        action_sent=np.zeros(7, np.float32),
+        action_planned=np.zeros(ACTION_DIM, np.float32),
+        action_sent=np.zeros(ACTION_DIM, np.float32),
         depth_reconstructed=images[0].astype(np.float32),
         depth_imagined=images[1:].astype(np.float32),
-        plan=np.zeros((4, 7), np.float32),
+        plan=np.zeros((4, ACTION_DIM), np.float32),
         candidates=Candidates(rng.uniform(0, 0.5, (32, 4, 2, 3)), rng.normal(size=32)),
         value=1.0,
         termination=0.01,
@@ -198,11 +198,6 @@ def _fanout(mcap: Sink, rerun: Sink) -> AsyncFanout:
     )
 
 
-def _free_port() -> int:
-    with socket.create_server((LOOPBACK, 0)) as server:
-        return int(server.getsockname()[1])
-
-
 @contextlib.contextmanager
 def _opened(sink: Sink) -> Iterator[Sink]:
     sink.open(_INFO)
@@ -221,9 +216,9 @@ def _stalled(mcap: Sink, rerun: Sink) -> Iterator[Sink]:
 
 @contextlib.contextmanager
 def _dead(mcap: Sink) -> Iterator[Sink]:
-    viewer = Viewer(f"rerun+http://{LOOPBACK}:{_free_port()}/proxy")
+    viewer = Viewer(f"rerun+http://{LOOPBACK}:{free_port()}/proxy")
     with (
-        LiveRerun("web", viewer, _free_port()) as live,
+        LiveRerun("web", viewer, free_port()) as live,
         _opened(_fanout(mcap, RerunSink(live.viewer))) as sink,
     ):
         assert live.pid is not None

@@ -15,6 +15,7 @@ import errno
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,9 +29,9 @@ from egovcp.flags import HELP, config_file, flag_values, merged, split_flags
 from egovcp.help_text import help_text
 from egovcp.outputs import check_output_files
 from egovcp.terminal import echo, one_line, without_token
-from egovcp.values import WrongValue, build
+from egovcp.values import WrongValue, build, convert
 
-_DEBUG: Final = {"--debug": True, "--debug=true": True, "--debug=false": False}
+_DEBUG: Final = "--debug"
 
 type Defaults = Callable[[Sequence[str]], Mapping[str, Any]]
 """Flags, each as ``--name=value`` -> nested default values."""
@@ -47,7 +48,7 @@ def parse_config[C](
 
     A flag without a value is true (``--resume`` is ``--resume=true``). A list is written
     ``[a, b]`` or ``(a, b)``. Flags and the config file override ``defaults``, which is called with
-    the flags. The help ends with ``epilog``.
+    the flags, also for the help. The help ends with ``epilog``.
 
     Raises:
         EgovcpError: a value is invalid; the message names the flag.
@@ -56,10 +57,10 @@ def parse_config[C](
     try:
         args = split_flags(argv, config_class, prog)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
-        if topics:
-            echo(help_text(config_class, prog, epilog, topics[-1]))
-            raise SystemExit(0)
         default_values = defaults(args) if defaults else {}
+        if topics:
+            echo(help_text(config_class, prog, epilog, topics[-1], default_values))
+            raise SystemExit(0)
         config = build(config_class, merged(default_values, flag_values(args, config_class)), "--")
     except WrongValue as error:
         raise UsageError(f"{error}; see {prog} --help") from None
@@ -83,12 +84,11 @@ def run_command[C](
     `EntryPoint` handles missing packages and closed pipes.
     """
     args = list(sys.argv[1:] if argv is None else argv)
-    given = [a for a in args if a in _DEBUG]
-    debug = bool(given) and _DEBUG[given[-1]]
+    debug = False
     raise_on_sigint()
     try:
-        plain = [a for a in args if a not in _DEBUG]
-        config = parse_config(config_class, plain, prog, epilog, defaults)
+        debug, others = _split_debug(args)
+        config = parse_config(config_class, others, prog, epilog, defaults)
         run(config)
     except KeyboardInterrupt:
         echo(f"{prog}: interrupted", error=True)
@@ -105,28 +105,42 @@ def run_command[C](
     return 0
 
 
+def _split_debug(args: Sequence[str]) -> tuple[bool, list[str]]:
+    """The value of ``--debug``, and the other arguments."""
+    debug, others = "false", list[str]()
+    for previous, arg in pairwise(["", *args]):
+        flag, equals, value = arg.partition("=")
+        if flag == _DEBUG:
+            debug = value if equals else "true"
+        elif previous == _DEBUG and not arg.startswith("-"):
+            debug = arg
+        else:
+            others.append(arg)
+    return convert(bool, debug, _DEBUG), others
+
+
 def given_options(argv: Sequence[str]) -> dict[str, str]:
     """Name -> value of the flags ``--name=value``."""
     return dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
 
 
 def preset_defaults(
-    presets: Mapping[str, Callable[[], object]], argv: Sequence[str]
+    presets: Mapping[str, Callable[[], object]], argv: Sequence[str], option: str = "preset"
 ) -> dict[str, Any]:
-    """The options of the preset that ``--preset`` or the config file names; empty without a known
-    one.
+    """The options of the preset that ``option``, as a flag or in the config file, names; empty
+    without a known one.
 
     Raises:
         UsageError: both are given, or the file cannot be read.
     """
     given = given_options(argv)
-    if "preset" in given and "config_path" in given:
+    if option in given and "config_path" in given:
         raise UsageError(
-            f"--preset={given['preset']} and --config_path={given['config_path']} both set "
-            "options; give one of them, and single options as flags; a file may name a preset"
+            f"--{option}={given[option]} and --config_path={given['config_path']} both set "
+            f"options; give one of them, and single options as flags; a file may name a {option}"
         )
     file = config_file(given["config_path"]) if given.get("config_path") else {}
-    name = given.get("preset") or str(file.get("preset", ""))
+    name = given.get(option) or str(file.get(option, ""))
     return dict(draccus.encode(presets[name]())) if name in presets else {}
 
 

@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import inspect
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
@@ -47,7 +47,7 @@ class _Option:
             words.append(f"[{self.bounds}]")
         if self.default is dataclasses.MISSING:
             words.append("(required)")
-        elif self.default not in ("", None, ()):
+        elif self.default not in ("", None, (), []):
             words.append(f"(default: {as_flag_value(self.default)})")
         return f"{self.flag} {self.kind}", " ".join(words)
 
@@ -64,11 +64,18 @@ class _Group:
         return not self.name or ("." not in self.name and len(self.options) <= _SMALL_GROUP)
 
 
-def help_text(config_class: type, prog: str = "", epilog: str = "", topic: str = "") -> str:
+def help_text(
+    config_class: type,
+    prog: str = "",
+    epilog: str = "",
+    topic: str = "",
+    defaults: Mapping[str, Any] | None = None,
+) -> str:
     """The help of a command.
 
     Args:
         topic: a group such as ``policy.loss``, `ALL`, `FLAGS`, or empty for the overview.
+        defaults: nested values that replace defaults of the class.
 
     Raises:
         UsageError: there is no such group.
@@ -79,7 +86,7 @@ def help_text(config_class: type, prog: str = "", epilog: str = "", topic: str =
         return "\n".join(" ".join([flag, *choices(kind)]) for flag, kind in kinds.items())
     groups = [
         dataclasses.replace(group, options=tuple(o for o in group.options if o.flag in flags))
-        for group in _groups(config_class, None, "")
+        for group in _groups(config_class, defaults or {}, "")
         if not group.name or f"--{group.name}" in flags
     ]
     if not topic:
@@ -96,11 +103,11 @@ def _overview(groups: Sequence[_Group]) -> Iterator[str]:
     for group in groups:
         if group.is_short:
             yield from _section(group, full=False)
-    rows = []
+    rows, shown = [], {group.name for group in groups if group.is_short}
     for group in groups:
         inner = [g for g in groups if f"{g.name}.".startswith(f"{group.name}.")]
-        hidden = sum(len(g.options) for g in inner if not g.is_short)
-        if group.name and "." not in group.name and hidden:
+        hidden = sum(len(g.options) for g in inner)
+        if hidden and not group.is_short and group.name.rpartition(".")[0] in shown:
             count = f"{hidden} option{'s' if hidden > 1 else ''}"
             rows.append((f"{group.name} ({count})", group.summary.partition(". ")[0]))
     if rows:
@@ -127,11 +134,11 @@ def _table(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
         yield from (" " * _COLUMN + line for line in lines[1:])
 
 
-def _groups(config_class: Any, config: Any, name: str) -> Iterator[_Group]:
+def _groups(config_class: Any, defaults: Mapping[str, Any], name: str) -> Iterator[_Group]:
     """The options of a dataclass, then those of the dataclasses in it.
 
     Args:
-        config: an instance that has the defaults; None: those of the class.
+        defaults: values that replace defaults of the class, nested or an instance for a group.
     """
     kinds, documents = option_types(config_class), dict(field_docs(config_class))
     prefix = f"{name}." if name else ""
@@ -140,10 +147,9 @@ def _groups(config_class: Any, config: Any, name: str) -> Iterator[_Group]:
         file = "Read options from this YAML, JSON or TOML file; flags override them."
         options.append(_Option(CONFIG_FILE, "text", file, ""))
     for field in dataclasses.fields(config_class):
-        kind, default = kinds[field.name], default_of(field)
-        default = default if config is None else getattr(config, field.name)
+        kind, default = kinds[field.name], defaults.get(field.name, default_of(field))
         if is_dataclass_type(kind):
-            inner = default if isinstance(default, kind) else None
+            inner = default if isinstance(default, Mapping) else getattr(default, "__dict__", {})
             nested.append((kind, inner, f"{prefix}{field.name}"))
         else:
             text, bounds = documents.get(field.name, ""), str(bounds_of(field) or "")

@@ -45,7 +45,7 @@ class PlannerOptions:
     horizon: int | None = bounded(None, least=1, most=1000)
     """N, planning horizon, planner steps (of 40 ms for the G1)."""
     objective: Objective | None = None
-    """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
+    """V of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward."""
     iterations: int | None = bounded(None, least=1, most=10_000)
     """Iterations of the search."""
@@ -68,7 +68,7 @@ class PlannerOptions:
     optimiser: OptimiserName | None = None
     """Optimiser: cem, icem, mppi or shooting."""
     mirror: bool | None = None
-    """Average J with that of the mirrored plan in the mirrored scene, if the robot is symmetric."""
+    """Average V with that of the mirrored plan in the mirrored scene, if the robot is symmetric."""
     backend: BackendName | None = None
     """Implementation of the networks: auto, eager, float32 or int8."""
 

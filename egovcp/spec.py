@@ -107,8 +107,13 @@ ACTION_NAMES: Final = (
 )
 ACTION_DIM: Final = 7
 ACTION_HANDS: Final = slice(0, 6)
-ACTION_ETA: Final = 0.32  # random-walk step of the paper (section III-B), box units per tick
-ACTION_RATE_LIMIT: Final = 0.32  # box units per planner tick; same in collection and deployment
+# In normalised units ([-1, 1]):
+ACTION_ETA: Final = 0.32  # largest step of the paper's random walk (section III-B), each tick
+ACTION_RATE_LIMIT: Final = 0.32  # per planner tick; same in collection and deployment
+#: Of the default random walk of the data, which holds its targets: largest step, and planner ticks
+#: from one step to the next (least, most). The low-level controller is trained on both walks.
+HELD_ETA: Final = 1.0
+HELD_TICKS: Final = (5, 15)
 
 
 def reflect(action: NDArray[np.floating], low: NDArray[np.floating] | float = -1.0) -> _Array:
@@ -120,11 +125,10 @@ def reflect(action: NDArray[np.floating], low: NDArray[np.floating] | float = -1
 
 @dataclass(frozen=True)
 class ActionBox:
-    """The box that a normalised action in [-1, 1]^7 spans, in SI units.
+    """The box that a normalised action in [-1, 1]^A spans, in SI units.
 
-    The map is affine on each side of the neutral pose, so that 0 *is* the neutral
-    pose (hands at rest, standing tall) although the box reaches much farther one way
-    than the other: -1 -> ``low``, 0 -> ``neutral``, +1 -> ``high``.
+    The map is affine on each side of the neutral pose: -1 -> ``low``, 0 -> ``neutral``, 1 ->
+    ``high``. So 0 is a pose to rest in, although the box may reach farther one way than the other.
     """
 
     low: tuple[float, ...]
@@ -132,14 +136,14 @@ class ActionBox:
     high: tuple[float, ...]
 
     def to_metric(self, action: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Normalised action ``(..., 7)`` in [-1, 1] -> metres ``(..., 7)``."""
+        """Normalised action (..., A) in [-1, 1] -> SI units (..., A)."""
         a = np.asarray(action, dtype=np.float64)
         low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
         metric: NDArray[np.float64] = mid + np.where(a < 0, a * (mid - low), a * (high - mid))
         return metric
 
     def to_normalised(self, metric: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Metres ``(..., 7)`` -> normalised action ``(..., 7)``; the inverse of ``to_metric``."""
+        """SI units (..., A) -> normalised action (..., A); the inverse of `to_metric`."""
         m = np.asarray(metric, dtype=np.float64)
         low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
         d = m - mid

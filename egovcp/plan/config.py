@@ -39,7 +39,7 @@ class PlannerConfig:
     horizon: int = bounded(4, least=1, most=1000)
     """N, planning horizon, steps."""
     objective: Objective = "value"
-    """J of a candidate. value: mean of Q over the horizon (equation 15); reward: discounted sum of
+    """V of a candidate. value: mean of Q over the horizon (equation 15); reward: discounted sum of
     predicted rewards (Rew-MPC); td: the same plus gamma^N Q at the end (TD-MPC). The last two need
     a model trained with loss.reward."""
     iterations: int = bounded(3, least=1, most=10_000)
@@ -49,7 +49,7 @@ class PlannerConfig:
     min_std: float = bounded(0.1, least=0, most=10)
     """Smallest sampling standard deviation, in units of eta."""
     eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
-    """Largest action change per step, in units of the action box."""
+    """Largest action change per step, normalised action units ([-1, 1])."""
     action_rate_cost: float = bounded(spec.ACTION_RATE_COST, least=0, most=1e6)
     """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step; that of the data's
     reward."""
@@ -78,7 +78,7 @@ class PlannerConfig:
     sample_decay: float = bounded(1.25, least=1, most=1000)
     """icem: factor by which the number of samples shrinks per iteration."""
     mirror: bool = True
-    """If the robot is symmetric, average J with that of the mirrored plan in the mirrored scene."""
+    """If the robot is symmetric, average V with that of the mirrored plan in the mirrored scene."""
     backend: BackendName = "auto"
     """eager: the world model itself; float32: packed networks; int8: 8-bit integers, by a library
     compiled on first use (CPU only); auto: int8 on CPUs where it is fast, else float32."""

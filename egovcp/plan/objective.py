@@ -1,8 +1,8 @@
-"""Objectives J of plans (equation 15), and their reference evaluation with a world model.
+"""Values V of plans (equation 15), and their reference evaluation with a world model.
 
-value     J = 1/N sum_{k<N} Q(h_{t+k}, z^_{t+k}, a_{t+k})                       the paper's
-reward    J = sum_{k<N} gamma^k r(h_{t+k}, z^_{t+k}, a_{t+k})                   Rew-MPC
-td        J = the same + gamma^N Q(h_{t+N}, z^_{t+N}, a_{t+N})                  TD-MPC
+value     V = 1/N sum_{k<N} Q(h_{t+k}, z^_{t+k}, a_{t+k})                       the paper's
+reward    V = sum_{k<N} gamma^k r(h_{t+k}, z^_{t+k}, a_{t+k})                   Rew-MPC
+td        V = the same + gamma^N Q(h_{t+N}, z^_{t+N}, a_{t+N})                  TD-MPC
 
 TD-MPC evaluates Q_N at the action of a trained policy. There is none here, so the candidate has one
 more action, which the search optimises.
@@ -22,7 +22,7 @@ from egovcp.plan.config import PlannerConfig
 from egovcp.robot_spec import RobotSpec
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
-"""J (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
+"""V (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
 
 
 class PlanEvaluator[C](Protocol):
@@ -86,7 +86,7 @@ def mirrored_actions(actions: Tensor, robot: RobotSpec) -> Tensor:
 
 
 class MirroredEvaluator(NamedTuple):
-    """J of a plan, averaged with that of its mirror image in the mirrored scene.
+    """V of a plan, averaged with that of its mirror image in the mirrored scene.
 
     The true values are equal, and the errors of Q partly independent, so the mean has less error.
     States are (2 E, ...): those of E robots, then of the same robots as seen in a mirror.
@@ -107,7 +107,7 @@ class MirroredEvaluator(NamedTuple):
 
 
 class ReturnAccumulator:
-    """Accumulates J of plans step by step, and selects the head that each step needs.
+    """Accumulates V of plans step by step, and selects the head that each step needs.
 
     A failed plan has the value ``floor``, or the reward (1 - gamma) floor at each step, whose
     endless discounted sum is the floor. So under ``td`` a failure at step j contributes
@@ -136,7 +136,7 @@ class ReturnAccumulator:
         return self._is_mean or at_the_end
 
     def needs_termination(self, k: int) -> bool:
-        """Whether the termination probability of step k affects J."""
+        """Whether the termination probability of step k affects V."""
         return 0 < k < self._steps - 1
 
     def add_value(self, q: Tensor) -> None:
@@ -153,12 +153,12 @@ class ReturnAccumulator:
             self._survival = self._survival * (probability <= self._config.termination_threshold)
 
     def plan_value(self) -> Tensor:
-        """J, (...)."""
-        j = self._above + self._below
+        """V, (...)."""
+        v = self._above + self._below
         if self._is_mean:
-            j = j / self._steps
-        assert isinstance(j, Tensor)
-        return j
+            v = v / self._steps
+        assert isinstance(v, Tensor)
+        return v
 
     def _add(self, value: Tensor, floor: Tensor | float) -> None:
         self._above = self._above + self._weight * self._survival * (value - floor)
@@ -172,7 +172,7 @@ def evaluate[L](
     config: PlannerConfig,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """J (E, M) of plans (E, M, A, 7) from the robots' carry (E, ...), A = `PlannerConfig.actions`.
+    """V (E, M) of plans (E, M, A, 7) from the robots' carry (E, ...), A = `PlannerConfig.actions`.
 
     Args:
         generator: of the noise under ``latent=sample``; None: torch's own.

@@ -1,7 +1,7 @@
 """Value-guided sampling MPC (paper section III-D): sample plans, evaluate them, refine the samples.
 
 Candidates change by at most eta per step from the last executed action, a_k = a_{k-1} + eta *
-delta_k with delta in [-1, 1]^7. A search has no side effects and reads no clock but ``remaining``.
+delta_k with delta in [-1, 1]^A. A search has no side effects and reads no clock but ``remaining``.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def make_plan[C](
 ) -> Plan:
     """Plan for E robots from ``carry`` (E, ...), a_{t-1} = ``executed`` (E, 7).
 
-    Maximises J = evaluator's value - `action_costs`, known terms of the reward that Q does not
-    learn.
+    Maximises J = V - C: the evaluator's value minus `action_costs`, known terms of the reward that
+    Q does not learn.
 
     Args:
         warm: (E, N, 7) deltas of the previous plan, already shifted; None: zeros.

@@ -1,16 +1,17 @@
-"""`egovcp-experiment NAME --output_dir=... [--NAME=VALUE ...]`: run one of the experiments."""
+"""`egovcp-experiment EXPERIMENT --output_dir=... [--NAME=VALUE ...]`: run an experiment."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
 import draccus
 
 from egovcp.artifact import load_artifact
-from egovcp.cli import given_options
+from egovcp.cli import preset_defaults
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError
 from egovcp.files import user_path
@@ -18,25 +19,11 @@ from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
-from egovcp_experiment.config import SCALES, ExperimentConfig, small
+from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report import publish
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
-
-
-def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
-    """Defaults of all options: the configuration of the scale in ``argv``.
-
-    Raises:
-        UsageError: a config file would override it.
-    """
-    given = given_options(argv)
-    if "config_path" in given:
-        raise UsageError("--config_path would hide the scale; give single options as flags")
-    scale = SCALES.get(given.get("scale", ""), small)  # the parser refuses an unknown one
-    encoded: dict[str, Any] = draccus.encode(scale())
-    return encoded
 
 
 def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
@@ -110,13 +97,16 @@ COMMANDS: Final = CommandGroup(
     "Run one of the paper's experiments, cell by cell, and write its report.",
     {
         name: Subcommand(
-            f"{__name__}:execute", experiment.summary, defaults=scale_of, takes_argv=True
+            f"{__name__}:execute",
+            experiment.summary,
+            defaults=partial(preset_defaults, SCALES, option="scale"),
+            takes_argv=True,
         )
         for name, experiment in EXPERIMENTS.items()
     },
     "--output_dir is required; --scale sets the defaults of all other options. "
-    "Writes NAME.json, NAME.md and NAME.html beside cells/ (results), work/ (datasets, models) and "
-    "logs/. Ctrl-C stops all cells cleanly; the same command goes on.",
+    "Writes EXPERIMENT.json, .md and .html beside cells/ (results), work/ (datasets, models) and "
+    "logs/. Ctrl-C stops all cells cleanly; rerun the same command to continue.",
     noun="experiment",
 )
 main = COMMANDS.main

@@ -11,7 +11,6 @@ from egovcp.errors import UsageError, suggest
 
 #: The paper's tasks.
 TASKS: Final = ("ball", "wall", "arch")
-_PLAY_SEED: Final = 2  # options were tuned on the scenarios of seeds 0, 1 and 3
 
 
 @dataclass(frozen=True)
@@ -51,16 +50,16 @@ class TrainingConfig:
     """Preset of egovcp-train."""
     steps: int = bounded(20_000, least=1)
     """Gradient steps of a model."""
-    max_minutes: float = bounded(0.0, least=0)
+    max_minutes: float = bounded(10.0, least=0)
     """Wall-clock limit of a training, minutes; 0: none."""
-    compared_steps: int = bounded(20_000, least=1)
+    compared_steps: int = bounded(1000, least=1)
     """Gradient steps, without a time limit, of models that table1 and ablations compare."""
     seeds: tuple[int, ...] = bounded((0,), least=0)
     """Training seeds; every model is trained once with each."""
     policies: dict[str, str] = field(default_factory=dict)
     """Existing policies per task (all: the multi-task model) instead of training the default model,
     '{ball: RUN/checkpoints/last/pretrained_model}'; used for every seed."""
-    flags: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ("--eval_freq=0", "--tensorboard=false")
     """Further flags of egovcp-train."""
 
     @property
@@ -77,12 +76,12 @@ class PlayConfig:
 
     episodes: int = bounded(100, least=1, most=1_000_000)
     """Scenarios of each task; all variants play the same ones."""
-    seed: int = bounded(0, least=0)
+    seed: int = bounded(2, least=0)  # options were tuned on the scenarios of seeds 0, 1 and 3
     """Seed of the held-out scenarios."""
-    branches: int = bounded(12, least=2, most=10_000)
+    branches: int = bounded(6, least=2, most=10_000)
     """Random-walk rollouts from each plan step; their mean return is what Q is compared with
     (experiment `variance`)."""
-    budget_ms: float = bounded(40.0, above=0)
+    budget_ms: float = bounded(12.0, above=0)  # 64 candidates on one core without AVX-512
     """Time budget per plan in the experiment `planners`, ms."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-eval; studies in simulation use those of the planner."""
@@ -217,6 +216,7 @@ def smoke() -> ExperimentConfig:
         train=TrainingConfig(
             preset="debug",
             steps=4,
+            max_minutes=0.0,
             compared_steps=4,
             flags=(
                 "--batch_size=4",
@@ -237,7 +237,7 @@ def smoke() -> ExperimentConfig:
             flags=("--ppo.num_mini_batches=2", "--tensorboard=false", "--threads=1"),
         ),
         play=PlayConfig(
-            episodes=4, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
+            episodes=4, seed=0, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
         ),
     )
 
@@ -245,16 +245,7 @@ def smoke() -> ExperimentConfig:
 def small() -> ExperimentConfig:
     """Hours on two cores: at most 500 000 random steps per task, ten minutes of training per model,
     100 paired episodes."""
-    return ExperimentConfig(
-        scale="small",
-        train=TrainingConfig(
-            max_minutes=10.0,
-            compared_steps=1000,
-            flags=("--eval_freq=0", "--tensorboard=false"),
-        ),
-        # 12 ms are 64 candidates on one core without AVX-512.
-        play=PlayConfig(seed=_PLAY_SEED, branches=6, budget_ms=12.0),
-    )
+    return ExperimentConfig()
 
 
 def paper() -> ExperimentConfig:
@@ -265,10 +256,14 @@ def paper() -> ExperimentConfig:
             EpisodesConfig(ball=8334, wall=5000, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
         ),
         train=TrainingConfig(
-            steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
+            steps=100_000,
+            max_minutes=0.0,
+            compared_steps=100_000,
+            seeds=(0, 1, 2),
+            flags=("--eval_freq=0",),
         ),
         ppo=PpoBaselineConfig(steps=5_000_000, policies=10),
-        play=PlayConfig(episodes=300, seed=_PLAY_SEED),
+        play=PlayConfig(episodes=300, branches=12, budget_ms=40.0),
     )
 
 

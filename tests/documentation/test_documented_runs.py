@@ -11,7 +11,7 @@ import pytest
 from huggingface_hub import HfApi
 
 from egovcp.log.viewer import LiveRerun, Viewer
-from tests.support.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, redirect_hub
 from tests.support.ports import free_port
 
 from .markdown import DocumentedCommand, Text
@@ -91,7 +91,7 @@ def _subcommand(command: DocumentedCommand) -> str:
 def published(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A Hub with the datasets that pages name."""
     place = tmp_path_factory.mktemp("hub")
-    with FakeHub(place / "hub") as hub, in_this_process(hub.endpoint, place / "home"):
+    with FakeHub(place / "hub") as hub, redirect_hub(hub.endpoint, place / "home"):
         api = HfApi(endpoint=hub.endpoint, token="hf_any")
         for repository, folder in _PUBLISHED.items():
             api.create_repo(repository, repo_type="dataset")

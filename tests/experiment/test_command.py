@@ -21,6 +21,20 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(
+    ("flag", "budget_ms"), [("--jobs=1", 12.0), ("--scale=paper", 40.0), ("--config_path", 5.0)]
+)
+def test_help_shows_the_defaults_of_the_scale(
+    flag: str, budget_ms: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if flag == "--config_path":
+        (tmp_path / "options.yaml").write_text("scale: smoke")
+        flag = f"{flag}={tmp_path / 'options.yaml'}"
+    with pytest.raises(SystemExit):
+        main(["planners", flag, "--help=play"])
+    assert f"(default: {budget_ms})" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("argv", "message"),
     [
         ([], ""),
@@ -30,7 +44,7 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
         (["planners", "--output_dir=x", "--scenes=[--seed=3]"], "expected --env.NAME=value"),
         (["planners", "--output_dir=x", "--only=[cme]"], "did you mean 'cem'"),
         (["planners", "--output_dir=x", "--jobs=0"], "--jobs=0"),
-        (["planners", "--config_path=a.yaml"], "would hide the scale"),
+        (["planners", "--scale=small", "--config_path=a.yaml"], "both set options"),
         (["table1", "--output_dir=x", "--train.seeds=[0,1,0]"], "[0, 1, 0]: expected at least one"),
         (["table1", "--output_dir=x", "--train.seeds=[]"], "--train.seeds=[]"),
         (["table1", "--output_dir=x", "--train.seeds=[-1]"], "--train.seeds=[-1]"),

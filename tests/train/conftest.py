@@ -1,6 +1,5 @@
 """A tiny dataset and the shortest of training runs."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.flags import flags_of, merged, options_of
 from egovcp_train.config import PRESETS, TrainConfig
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 CONTROLLER = "stance-test"
 

@@ -12,8 +12,8 @@ import pytest
 
 from egovcp import spec
 from egovcp_train.train import main
+from tests.support.arguments import Arguments
 
-type Arguments = Callable[..., list[str]]
 type Damage = Callable[[Path], object]
 
 DATA = "data/chunk-000/file-000.parquet"

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 TD = {"policy__loss__q_target": "td", "policy__loss__td_decay": 0.5}
 ARWM = {"policy__dynamics": "autoregressive", "policy__loss__autoregressive_steps": 4}

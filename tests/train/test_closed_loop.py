@@ -1,7 +1,6 @@
 """Playing in simulation at evaluations."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,8 +11,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 from egovcp_train.closed_loop import ClosedLoop
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 PLANNER = PlannerConfig(samples=8, elites=2, iterations=1)
 

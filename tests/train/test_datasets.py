@@ -16,8 +16,7 @@ from egovcp.data import DatasetWriter, Provenance
 from egovcp.testing import random_episode
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 
 @pytest.fixture

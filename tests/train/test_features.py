@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,8 @@ import pytest
 from egovcp.artifact import load_artifact
 from egovcp.data import open_dataset
 from egovcp_train.train import main
+from tests.support.arguments import Arguments
 from tests.support.lerobot_datasets import ACTION, DEPTH, ONE, STATE, write_features
-
-type Arguments = Callable[..., list[str]]
 
 FEATURES = {
     "observation.images.wrist": {**DEPTH, "shape": (48, 64, 1)},

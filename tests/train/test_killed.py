@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,8 +16,7 @@ from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 _PATIENCE_S = 200.0
 

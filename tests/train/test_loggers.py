@@ -2,7 +2,6 @@
 
 import errno
 import sys
-from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -13,8 +12,7 @@ import pytest
 
 from egovcp.artifact import load_artifact
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 
 def test_scalars_and_pictures_go_to_tensorboard(arguments: Arguments, tmp_path: Path) -> None:
@@ -75,9 +73,6 @@ def _weights(run: Path) -> bytes:
 
 
 # --- Weights & Biases, with a stand-in for the package -------------------------------
-type Arguments = Callable[..., list[str]]
-
-
 class _Run:
     def __init__(self, run_id: str) -> None:
         self.id = run_id

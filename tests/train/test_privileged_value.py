@@ -1,7 +1,6 @@
 """The fit of the privileged value, and training with it."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -23,8 +22,7 @@ from egovcp_train.config import PrivilegedValueConfig
 from egovcp_train.loop import Budget
 from egovcp_train.privileged_value import Critic, Transitions
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 _CONFIG = PrivilegedValueConfig(updates=600, rows=128, lr=3e-3)
 _PLANNER = PlannerConfig()

@@ -25,8 +25,7 @@ from egovcp_train.checkpoint import load_training_state, new_checkpoint
 from egovcp_train.config import TrainConfig
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.train import main
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 
 def _stop_after(monkeypatch: pytest.MonkeyPatch, step: int, number: int) -> None:

@@ -5,7 +5,6 @@ import os
 import pwd
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import draccus
@@ -29,9 +28,8 @@ from egovcp_train.config import ABLATIONS, PRESETS, TrainConfig
 from egovcp_train.device import choose_bf16
 from egovcp_train.loop import Learner
 from egovcp_train.train import main, option_defaults
+from tests.support.arguments import Arguments
 from tests.support.earlier import without_optional_columns
-
-type Arguments = Callable[..., list[str]]
 
 
 def _files(root: Path) -> dict[str, bytes]:

@@ -1,7 +1,6 @@
 """egovcp-train on a dataset of the Hub, streamed: pinned, resumable, honest about a network."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
+from tests.support.arguments import Arguments
 from tests.support.hub import FakeHub
-
-type Arguments = Callable[..., list[str]]
 
 CONTROLLER = "stance-test"
 QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
@@ -45,7 +43,7 @@ def many_files(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.fixture
 def commit(hub: FakeHub, many_files: Path) -> str:
     made = _publish(many_files)
-    hub.heal()
+    hub.reset()
     return made
 
 
@@ -136,7 +134,7 @@ def test_a_lost_network_ends_the_run_and_a_resumed_one_goes_on_with_the_next_bat
         assert main(streamed(lost, steps=20)) == 5
     assert "the Hub cannot be used" in capsys.readouterr().err.splitlines()[-1]
     assert 3 <= load_training_state(lost)["learner"]["step"] < 20
-    hub.heal()
+    hub.reset()
     assert main([f"--output_dir={lost}", "--resume"]) == 0
 
     assert main(streamed(tmp_path / "straight", steps=20)) == 0

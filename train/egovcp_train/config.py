@@ -177,9 +177,8 @@ class TrainConfig:
     steps: int = bounded(6000, least=1)
     """Gradient steps."""
     max_minutes: float = bounded(0.0, least=0)
-    """Wall-clock limit in minutes; the learning-rate schedule then follows elapsed time instead of
-    steps, so that a run is not reproducible step by step; 0: no limit. A resumed run has the rest
-    of it."""
+    """Wall-clock limit in minutes, over all resumes; the learning-rate schedule then follows
+    elapsed time instead of steps, so that a run is not reproducible step by step; 0: no limit."""
     batch_size: int = bounded(32, least=1, most=65_536)
     """Windows per gradient step."""
     seed: int = bounded(0, least=0)
@@ -244,7 +243,7 @@ def debug() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The paper's losses, returns and planner; no mirrored episodes, no averaged weights.
+    """The paper's losses, returns and planner; no mirrored episodes, no EMA weights.
 
     Returns that the time limit cuts short count (section III-D), and values after a termination
     are zero.
@@ -284,13 +283,13 @@ _ABLATED_LOSSES: Final[Mapping[str, Mapping[str, Any]]] = {
     "pixels_summed": {"depth": float(spec.DEPTH_ROWS * spec.DEPTH_COLS)},
     "state_summed": {"state": float(spec.STATE_DIM)},
     "state_1": {"state": 1.0, "multistep_state": 1.0},
-    "no_moving": {"motion_weight": 0.0},
+    "no_motion_weight": {"motion_weight": 0.0},
     "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0, "multistep_object": 0.0},
-    "no_near": {"proximity_weight": 0.0},
+    "no_proximity_weight": {"proximity_weight": 0.0},
     "no_object": {"object": 0.0, "multistep_object": 0.0},
     "no_sampled_actions": {"sampled_actions": 0},
     "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
-    "q_of_posterior_only": {"imagined_steps": 0},
+    "no_imagined_value": {"imagined_steps": 0},
 }
 
 

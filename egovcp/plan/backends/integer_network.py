@@ -81,7 +81,7 @@ class IntegerNetwork:
         return KernelPrefix(library.CSharedPrefix(words.data_ptr(), *addresses, nan), (words, sums))
 
     def plan_value(self, prefix: KernelPrefix, actions: Tensor, noise: Tensor | None) -> Tensor:
-        """J (M,) of plans (M, N, 7)."""
+        """V (M,) of plans (M, N, 7)."""
         plans, steps, _ = actions.shape
         values = torch.empty(plans)
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()

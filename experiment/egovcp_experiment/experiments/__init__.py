@@ -57,7 +57,7 @@ class Experiment:
 
 EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "ablations": Experiment(
-        "what each choice of the world model is worth on held-out episodes",
+        "effect of each design choice on held-out metrics",
         ablations.report,
         has_variants=True,
     ),
@@ -80,9 +80,7 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
         planners.report,
         has_variants=True,
     ),
-    "ppo": Experiment(
-        "PPO, the model-free baseline, along its training, next to the planner", ppo.report
-    ),
+    "ppo": Experiment("learning curve of PPO, compared with the planner", ppo.report),
     "sample-efficiency": Experiment(
         "success against the transitions that a model has seen (fig. 5)", sample_efficiency.report
     ),

@@ -17,8 +17,8 @@ from egovcp_experiment.report import ExperimentReport, Table
 #: Ablations that are presets of egovcp-train.
 _PRESETS: Final = (
     "paper", "kl_equal", "kl_tenfold", "no_free_nats", "free_nats_per_dimension", "pixels_summed",
-    "state_summed", "state_1", "no_moving", "no_multistep", "no_near", "value_weight_1",
-    "q_of_posterior_only", "no_object", "monte_carlo", "no_sampled_actions",
+    "state_summed", "state_1", "no_motion_weight", "no_multistep", "no_proximity_weight",
+    "value_weight_1", "no_imagined_value", "no_object", "monte_carlo", "no_sampled_actions",
 )  # fmt: skip
 #: Choice -> changed flags of egovcp-train.
 CHOICES: Final[dict[str, Flags]] = {
@@ -55,7 +55,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         for name, flags in config.chosen(CHOICES).items()
     }
     page = ExperimentReport(
-        "Ablations: what each choice of the world model is worth on held-out episodes",
+        "Ablations: effect of each design choice on held-out metrics",
         sections=[
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "

@@ -21,7 +21,7 @@ RULES: Final[dict[str, Flags]] = {
     "rule_survival": {"planner.termination_rule": "survival"},
     "random_walk": {"planner.action_parameterization": "random_walk"},
     "latent_sample": {"planner.latent": "sample"},
-    "one_view": {"planner.mirror": False},
+    "no_mirror": {"planner.mirror": False},
 }
 
 

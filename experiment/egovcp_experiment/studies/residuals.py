@@ -38,7 +38,7 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk, require_ordered_steps
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM, REWARD_TERMS
+from egovcp.spec import ACTION_DIM, HELD_ETA, HELD_TICKS, REWARD_TERMS
 from egovcp.terminal import echo
 from egovcp_experiment.studies import study
 
@@ -54,9 +54,9 @@ class ResidualsConfig(study.SimStudyConfig):
 
     branches: int = bounded(12, least=2)
     """Random walks per step of a plan; their mean return is what Q is compared with."""
-    eta: float = bounded(1.0, above=0, most=2)
-    """Largest step of the data's random walk, action box units; default of egovcp-collect."""
-    step_ticks: tuple[int, int] = bounded((5, 15), least=1, most=100_000)
+    eta: float = bounded(HELD_ETA, above=0, most=2)
+    """Largest step of the data's random walk, normalised action units ([-1, 1])."""
+    step_ticks: tuple[int, int] = bounded(HELD_TICKS, least=1, most=100_000)
     """Shortest and longest interval between steps of the walk, planner ticks."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box."""

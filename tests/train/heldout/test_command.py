@@ -2,7 +2,7 @@
 
 import json
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,7 @@ from egovcp_train.heldout import command, report
 from egovcp_train.heldout.command import main
 from egovcp_train.heldout.report import EpisodeBatch
 from egovcp_train.train import main as train
-
-type Arguments = Callable[..., list[str]]
+from tests.support.arguments import Arguments
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,8 @@ from egovcp.spec import (
     ACTION_RATE_LIMIT,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
+    HELD_ETA,
+    HELD_TICKS,
     reflect,
 )
 from egovcp_train.lowlevel.config import CommandConfig, DisturbanceConfig, Range
@@ -21,9 +23,6 @@ from egovcp_train.lowlevel.config import CommandConfig, DisturbanceConfig, Range
 Array = NDArray[np.float64]
 HEIGHT: Final = ACTION_DIM - 1
 """Index of the pelvis height in an action."""
-HELD_TICKS: Final = (5, 15)
-"""Planner ticks between the steps of a random walk that holds its targets, inclusive."""
-_HELD_ETA: Final = 1.0  # box units, step size of that random walk
 
 
 def between(easy: Range, hard: Range, difficulty: float) -> Range:
@@ -64,7 +63,7 @@ class Commands:
         self._ticks_left[rows] = (seconds * CONTROLLER_HZ).astype(np.intp) + 1
 
     def move_hands(self, rows: NDArray[np.intp], target: Array) -> None:
-        """Move hands to ``target`` (n, 6), box units, at the rate limit, and end their random
+        """Move hands to ``target`` (n, 6), normalised, at the rate limit, and end their random
         walk until the next command."""
         self._moves[rows, :HEIGHT] = False
         self._target[rows, :HEIGHT] = target
@@ -91,7 +90,7 @@ class Commands:
 
     def _walk_randomly(self) -> None:
         steps = ~self._held | (self._rest <= 0)
-        size = np.where(self._held, _HELD_ETA, ACTION_ETA) * steps
+        size = np.where(self._held, HELD_ETA, ACTION_ETA) * steps
         drawn = self._rng.integers(*HELD_TICKS, len(steps), endpoint=True)
         self._rest = np.where(self._held & steps, drawn, self._rest) - 1
         step = size[:, None] * self._rng.uniform(-1, 1, self._action.shape)

@@ -18,7 +18,7 @@ class CommandConfig:
     """The commands of training episodes; a new one every few seconds."""
 
     interval: Range = bounded((2.0, 6.0), least=0.02, most=3600)
-    """s between changes of velocity and of how hands and height move."""
+    """Interval between commands, s."""
     standing: float = bounded(0.4, least=0, most=1)
     """Share of commands with zero velocity."""
     forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.8)), least=-3, most=3)
@@ -31,15 +31,17 @@ class CommandConfig:
     """Share of the walking commands that go neither forwards nor backwards, only sideways or
     turning."""
     sideways: float = bounded(0.25, least=0, most=3)
-    """m/s at the hardest, either way, in a third of the other walking commands."""
+    """Largest speed sideways, m/s, at difficulty 1; in half of the commands in place and a third of
+    the other walking commands."""
     turning: float = bounded(0.7, least=0, most=5)
-    """rad/s at the hardest, either way, in a third of the other walking commands."""
+    """Largest yaw rate, rad/s, at difficulty 1; in half of the commands in place and a third of the
+    other walking commands."""
     standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), least=0.3, most=1)
-    """m, easy and hard."""
+    """Pelvis height while standing, m, easy and hard."""
     walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.52, 0.75)), least=0.3, most=1)
-    """m, easy and hard."""
+    """Pelvis height while walking, m, easy and hard."""
     acceleration: float = bounded(0.8, least=0.01, most=100)
-    """m/s^2 and rad/s^2 at which the commanded velocity changes."""
+    """Acceleration of the commanded velocity, m/s^2 and rad/s^2."""
     still_hands: float = bounded(0.2, least=0, most=1)
     """Share of commands with resting hands; the others follow a random walk."""
     held_hands: float = bounded(0.4, least=0, most=1)
@@ -56,18 +58,18 @@ class DisturbanceConfig:
     """Pushes, physical parameters and delay."""
 
     push_interval: Range = bounded((3.0, 8.0), least=0.02, most=3600)
-    """s between pushes."""
+    """Interval between pushes, s."""
     push: Range = bounded((0.1, 0.8), least=0, most=5)
-    """m/s of horizontal velocity at most, easy and hard."""
+    """Largest change of the horizontal velocity by a push, m/s, easy and hard."""
     wall: float = bounded(0.5, least=0, most=1)
     """Share of the pushes of a standing robot that go towards a wall, on which it may brace with
     its hands; only on the CPU, the mjlab task has no walls."""
     wall_push: tuple[Range, Range] = bounded(((0.2, 0.4), (0.3, 1.3)), least=0, most=5)
-    """m/s towards the wall, easy and hard."""
+    """Change of the velocity by a push towards the wall, m/s, easy and hard."""
     friction: Range = bounded((0.5, 1.1), least=0.01, most=5)
     """Sliding friction of the feet."""
     payload: Range = bounded((-0.5, 2.0), least=-2, most=30)
-    """kg on the torso."""
+    """Payload on the torso, kg."""
     mass_scale: Range = bounded((0.95, 1.05), least=0.5, most=2)
     """Factor on every mass."""
     stiffness_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
@@ -75,7 +77,7 @@ class DisturbanceConfig:
     damping_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
     """Factor on the damping of every joint."""
     delay: Range = bounded((0.0, 0.02), least=0, most=0.04)
-    """s from a measurement until the new joint targets act, rounded to physics steps."""
+    """Delay from a measurement until the new joint targets act, s, rounded to physics steps."""
     models: int = bounded(64, least=1, most=4096)
     """Robots of different physical parameters."""
 
@@ -86,24 +88,40 @@ class DisturbanceConfig:
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """Weights of the reward terms, per second; see `rewards`."""
+    """Weights of the reward terms, per second; * marks the reference of a quantity."""
 
     alive: float = 0.5
+    """1 at every tick."""
     velocity: float = 3.0
+    """exp(-|v - v*|^2 / 0.03) of the horizontal velocity v, m/s, averaged over 0.3 s."""
     turning: float = 1.0
+    """exp(-(w - w*)^2 / 0.1) of the yaw rate w, rad/s, averaged over 0.3 s."""
     height: float = 1.0
+    """exp(-(z - z*)^2 / 0.001) of the pelvis height z, m."""
     upright: float = 1.0
+    """exp(-|u - u*|^2 / 0.03) of the vertical u in the pelvis frame; u*: at the natural pitch."""
     contact: float = 1.0
+    """Share of the feet that stand or swing as the phase of the gait requires."""
     stepping: float = -1.0
+    """Amount of gait, 0 to 1, without a commanded velocity; 0 in the 2 s after a push."""
     torso_rate: float = -0.6
+    """Squared angular velocity of the torso beyond the commanded turning, rad^2/s^2, at most 10."""
     torso_change: float = -0.2
+    """Squared change of that angular velocity over a planner step, rad^2/s^2, at most 10."""
     slip: float = -0.5
+    """Squared horizontal velocity of each standing foot, m^2/s^2, at most 4, summed."""
     stance_width: float = -5.0
+    """By how much the lateral distance of the feet is below 0.16 m, m."""
     foot_heading: float = -1.0
+    """Squared sine of the yaw of each foot in the heading frame, summed."""
     action: float = -0.02
+    """Squared norm of the policy's action."""
     action_rate: float = -0.02
+    """Squared norm of the change of the action per tick."""
     torque: float = -1.0
+    """Mean of (torque / limit)^2 over the joints of legs and waist."""
     fall: float = -100.0
+    """1 at the tick of a fall."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +158,9 @@ class CurriculumConfig:
     """Difficulty of the first iteration."""
     step: float = bounded(0.004, least=0)
     """Change of the difficulty per iteration."""
-    few_falls: float = bounded(0.02, least=0, most=1)
+    low_fall_rate: float = bounded(0.02, least=0, most=1)
     """Falls per robot and second below which the task becomes harder."""
-    many_falls: float = bounded(0.08, least=0, most=1)
+    high_fall_rate: float = bounded(0.08, least=0, most=1)
     """Falls per robot and second above which it becomes easier."""
     tracking: float = bounded(0.65, least=0)
     """Mean velocity reward (1: perfect) above which the task becomes harder."""

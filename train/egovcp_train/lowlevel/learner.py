@@ -68,9 +68,9 @@ def next_difficulty(
         tracked: mean of the velocity reward, at most 1.
         rule: thresholds and step.
     """
-    if falls < rule.few_falls and tracked > rule.tracking:
+    if falls < rule.low_fall_rate and tracked > rule.tracking:
         difficulty += rule.step
-    elif falls > rule.many_falls:
+    elif falls > rule.high_fall_rate:
         difficulty -= rule.step
     return min(max(difficulty, 0.0), 1.0)
 

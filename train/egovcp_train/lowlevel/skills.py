@@ -16,9 +16,10 @@ from egovcp.spec import (
     ACTION_RATE_LIMIT,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
+    HELD_TICKS,
     reflect,
 )
-from egovcp_train.lowlevel.commands import HEIGHT, HELD_TICKS
+from egovcp_train.lowlevel.commands import HEIGHT
 
 Array = NDArray[np.float64]
 HOLD: Final = 60  # ticks for which a target is held

@@ -108,7 +108,7 @@ class Walls:
         self.remove(rows[since >= end])
 
     def _targets(self, rows: NDArray[np.intp], x: Snapshot) -> Array:
-        """(n, 6) hand targets on the walls, box units."""
+        """(n, 6) hand targets on the walls, normalised."""
         ahead = heading(rotation_matrix(x.quaternion[rows]))
         normal = self._normal[rows]
         forward = (

@@ -50,7 +50,7 @@ class PpoTrainConfig:
     network: ReactiveConfig = field(default_factory=ReactiveConfig)
     """Policy and critic."""
     initial_std: float = bounded(0.4, above=0)
-    """Standard deviation of the actions at the start, box units."""
+    """Standard deviation of the actions at the start, normalised action units ([-1, 1])."""
     ppo: RslRlPpoConfig = field(
         default_factory=lambda: RslRlPpoConfig(
             num_steps_per_env=50, desired_kl=0.01, gamma=GAMMA, entropy_coef=0.002

@@ -152,11 +152,11 @@ typedef struct {
     int32_t plans, steps;
     const float *actions; /* [plans][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
-    float *values;        /* [plans] J */
+    float *values;        /* [plans] V */
     ThreadPool pool;
 } Job;
 
-/* J of a plan, as in `ReturnAccumulator`, from row r of the results of `block` and the row's actions. */
+/* V of a plan, as in `ReturnAccumulator`, from row r of the results of `block` and the row's actions. */
 static float plan_value(const Job *job, int r, const float *values, const float *logits,
                     const float *actions) {
     const Readout *as = &job->net->readout;

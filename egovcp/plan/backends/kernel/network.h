@@ -55,7 +55,7 @@ typedef struct { /* two hidden layers over h, z and the action, with one output 
     Top many; /* if it has outputs */
 } Head;
 
-typedef struct { /* conversion of the outputs of the heads to J */
+typedef struct { /* conversion of the outputs of the heads to V */
     int32_t objective; /* an `Objective` */
     int32_t rule;      /* a `Rule` */
     int32_t bins;      /* of the distribution whose logits are the outputs of Q; 0: Q is the one output */
