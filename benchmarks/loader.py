@@ -53,7 +53,7 @@ from egovcp.hub import publish as publish_dataset
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # for tests.support
 
-from tests.support.hub import in_this_process  # noqa: E402
+from tests.support.hub import redirect_hub  # noqa: E402
 
 BATCH = 16
 HUB_REPO = "me/bench"
@@ -127,12 +127,12 @@ def measure_hub_epoch(folder: Path, episodes: int, length: int, rounds: int) -> 
     files = [path for path in root.rglob("*") if path.is_file()]
     contents = {path.relative_to(root).as_posix(): Content(path) for path in files}
     with serving(folder / "hub") as endpoint:
-        with in_this_process(endpoint, folder / "home"):
+        with redirect_hub(endpoint, folder / "home"):
             publish_dataset(Publication(HUB_REPO, contents, "a benchmark"), RetryPolicy())
         rows = []
         for _ in range(rounds + 1):
             disk = epoch_rate(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
-            with tempfile.TemporaryDirectory() as home, in_this_process(endpoint, Path(home)):
+            with tempfile.TemporaryDirectory() as home, redirect_hub(endpoint, Path(home)):
                 reader = DatasetReader.on_demand(DatasetConfig(repo_id=HUB_REPO))
                 rows.append((disk, epoch_rate(reader, config, shuffle)))
     return {

@@ -135,7 +135,7 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
     for name, (old, new) in differences(merged(setting, known), setting):
         raise UsageError(
             f"--constant.path={path} was found with {name}={as_flag_value(old)}, expected "
-            f"{as_flag_value(new)}; omit --constant.path to search the best action again"
+            f"{as_flag_value(new)}; omit --constant.path to search for the best action again"
         )
     return constants
 

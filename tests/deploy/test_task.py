@@ -76,7 +76,7 @@ def test_a_reference_that_cannot_be_imported_is_one_line(
     evaluate = EntryPoint("egovcp-eval", "egovcp_deploy.evaluate")
     assert evaluate(["--task=reach_task:Nothing"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("egovcp-eval: error: task 'reach_task:Nothing' of reach_task:Nothing")
+    assert line.startswith("egovcp-eval: error: task reach_task:Nothing cannot be used: ")
     assert "has no attribute 'Nothing'" in line
 
 

@@ -15,6 +15,7 @@ _SKIPPED = {"docs/log.md", "dataset_cards/template.md"}
 #: What stands for a name that the reader chooses -> such a name.
 _PLACEHOLDERS = {
     "NAME": "ablations",
+    "EXPERIMENT": "ablations",
     "TASK": "ball",
     "POLICY": "runs/ball/checkpoints/last/pretrained_model",
     "--run=RUN": "--run=eval",

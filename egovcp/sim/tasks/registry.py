@@ -54,7 +54,7 @@ class TaskEntry:
         """One line that names the plugin and what to do."""
         installed = self.origin != self.reference
         name = f"{self.name!r} of {self.origin}" if installed else self.reference
-        remedy = "repair or uninstall it" if installed else "repair the class"
+        remedy = "repair or uninstall it" if installed else "correct the name or the class"
         return f"task {name} cannot be used: {self.problem}; {remedy}"
 
 

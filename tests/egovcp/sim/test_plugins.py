@@ -297,7 +297,7 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
     assert arguments == ["--task=ball,post", "--seed=1"]
     monkeypatch.setattr(registry, "_found", None)  # as in a child process
     assert find_task("post").name == "post"
-    with pytest.raises(UsageError, match=r"task post_task:Nothing .* no attribute .*; repair the"):
+    with pytest.raises(UsageError, match=r"task post_task:Nothing .* no attribute .*; correct the"):
         register_task("post_task:Nothing")
 
 
