@@ -53,17 +53,19 @@ def _is_known(flag: str, known: set[str]) -> bool:
 def _named(text: str, own: set[str]) -> Iterator[str]:
     """Flags in a text that are not those of the command that it names before them."""
     for line in text.splitlines():
-        program = ""
+        program, is_list = "", False
         for word in re.split(r"[\s`'\",;()]+", line):
             if re.match(r"egovcp-\w|lerobot-\w|docker|pip|uv", word):
                 program = word
+            is_list = is_list or "[--" in word
             for flag in FLAG.findall(word.replace(".NAME", "")):
                 other = _flags_of_programs(program) if program.startswith("egovcp-") else own
-                if f"[{flag}" in word:  # an item of a list of flags for another command
+                if is_list:  # of flags for another command
                     other = _flags_of_programs("egovcp-")
                 foreign = bool(program) and not program.startswith("egovcp-")
                 if not foreign and not _is_known(flag, own | other | COMMON):
                     yield flag
+            is_list = is_list and "]" not in word
 
 
 @cache
