@@ -58,7 +58,7 @@ def value_map[L](
 
 
 def _normalised(metric: NDArray[np.float32], axis: int, like: Tensor) -> Tensor:
-    """Values of one axis, m -> box units."""
+    """Values of one axis, m -> normalised action units."""
     rows = np.tile(np.asarray(ACTION_BOX.neutral), (len(metric), 1))
     rows[:, axis] = metric
     return torch.as_tensor(ACTION_BOX.to_normalised(rows)[:, axis], dtype=like.dtype).to(

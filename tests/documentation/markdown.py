@@ -22,9 +22,11 @@ _ASSIGNMENT = re.compile(r"[A-Za-z_]+=")
 _FENCE = re.compile(r"\s*(`{3,}|~{3,})\s*(\w*)")
 _SPAN = re.compile(r"`([^`]+)`")
 
-#: Bash calls the function for each program that it does not find, and it finds none.
+#: Bash calls the function for each program that it does not find, and it finds none; a block
+#: that activates an environment is an error.
 _RECORD = r"""
 set -f
+readonly PATH
 command_not_found_handle() { printf '%s\0' "$#" "$@" >&3; }
 """
 
