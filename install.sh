@@ -22,4 +22,5 @@ if [ ! -x .venv/bin/python ]; then
   "$python" -m venv .venv
 fi
 .venv/bin/python -m pip install --quiet --disable-pip-version-check "uv>=0.8"
-VIRTUAL_ENV="$PWD/.venv" .venv/bin/uv sync --active --locked --inexact --quiet  # keeps other packages, such as your tasks
+# --inexact keeps other packages, such as tasks that a user has installed.
+VIRTUAL_ENV="$PWD/.venv" .venv/bin/uv sync --active --locked --inexact --quiet

@@ -15,6 +15,7 @@ import errno
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -57,7 +58,9 @@ def parse_config[C](
     try:
         args = split_flags(argv, config_class, prog)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
-        default_values = defaults(args) if defaults else {}
+        default_values: Mapping[str, Any] = {}
+        with suppress(*[EgovcpError] if topics else []):  # help is always possible
+            default_values = defaults(args) if defaults else {}
         if topics:
             echo(help_text(config_class, prog, epilog, topics[-1], default_values))
             raise SystemExit(0)

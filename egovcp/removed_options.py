@@ -30,6 +30,8 @@ RENAMED_OPTIONS: Final[Mapping[str, str]] = {
     "policy.loss.foresight_every": "policy.loss.multistep_stride",
     "planner.process": "planner.action_parameterization",
     "robot.limits.picture_hold_s": "robot.limits.image_hold_s",
+    "curriculum.few_falls": "curriculum.low_fall_rate",
+    "curriculum.many_falls": "curriculum.high_fall_rate",
 }
 #: Option, or group of options -> one sentence.
 REMOVED_OPTIONS: Final[Mapping[str, str]] = {

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import MAX_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds, check_cores
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
@@ -73,6 +73,8 @@ class CollectConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for invalid values and combinations."""
+        check_bounds(self, "--")
+        check_cores(self, "--")
         if self.preset not in PRESETS:
             raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         require_training_seed(self.seed)
@@ -86,7 +88,7 @@ class CollectConfig:
                 f"{', '.join(tasks)}"
             )
         shortest, longest = require_ordered_steps(self.step_ticks)
-        reachable = shortest * ACTION_RATE_LIMIT
+        reachable = min(2.0, shortest * ACTION_RATE_LIMIT)
         if self.eta > reachable:
             raise UsageError(
                 f"--eta={self.eta}: expected more than 0 and at most {reachable:g}, which is what "

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp.checks.lerobot_episode import (
@@ -31,6 +32,7 @@ from egovcp.checks.lerobot_episode import (
 from egovcp.data import schema
 from egovcp.data.features import values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, episode_runs
+from egovcp.data.parquet import data_errors
 from egovcp.data.paths import files_below, require_file
 from egovcp.data.pictures import decode_frames, frame_times
 from egovcp.data.stats import aggregate_named
@@ -126,7 +128,8 @@ class LeRobotCheck:
         try:
             file = self.reader.open_data(path)
             names = file.schema_arrow.names
-            fits = rows == file.metadata.num_rows and min(lengths.values(), default=0) > 0
+            starts = np.cumsum([0, *lengths.values()])
+            fits = 0 < starts[-1] == file.metadata.num_rows and _begin_at(file, path, starts[:-1])
             if not fits and "episode_index" not in names:
                 raise DataError.at(path, "lacks the column episode_index")
         except DataError as error:
@@ -140,7 +143,7 @@ class LeRobotCheck:
             yield DataError.at(path, problem)
         present = [k for k in dict.fromkeys([*columns, "episode_index"]) if k in names]
         found, damaged = set[int](), set[int]()
-        # If as many rows are listed as there are, episode_index is checked instead of used.
+        # If the listed episodes begin where frame_index is 0, episode_index is checked, not used.
         episodes = np.array([*lengths.items()]) if fits else None
         for part in episode_runs(file, path, present, listed=episodes):
             if isinstance(part, DataError):
@@ -328,6 +331,16 @@ class LeRobotCheck:
             if row is not None and (recorded := row.stats(key)):
                 for problem in statistics_problems(recorded, statistics, feature):
                     yield DataError.at(row.table_path, f"statistics of {key}: {problem}", number)
+
+
+def _begin_at(file: pq.ParquetFile, path: Path, rows: NDArray[np.int64]) -> bool:
+    """Whether ``frame_index`` is 0 in these rows and in no other."""
+    try:
+        with data_errors(path):
+            table = file.read(columns=["frame_index"], use_threads=False)
+    except DataError:
+        return False
+    return np.array_equal(np.flatnonzero(np.asarray(table) == 0), rows)
 
 
 def _row_problems(row: EpisodeRow, number: int, end: int) -> Iterator[str]:

@@ -59,7 +59,10 @@ def naming_plugins[**P, R](function: Callable[P, R]) -> Callable[P, R]:
         except EgovcpError:
             raise
         except Exception as error:
-            raise plugin_failure(error) or error from error
+            failure = plugin_failure(error)
+            if failure is None:
+                raise
+            raise failure from error
 
     return call
 

@@ -61,7 +61,7 @@ class MujocoRobot(ABC):
         if self.camera not in cameras:
             raise EnvironmentFailure(
                 f"robot {type(self).__name__}: its model has no camera {self.camera!r} (found: "
-                f"{', '.join(cameras) or 'none'}); name the depth camera so in build"
+                f"{', '.join(cameras) or 'none'}); set the name in build or the attribute camera"
             )
         self._camera = cameras.index(self.camera)
         rows, columns = self.spec.depth

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ from tqdm import tqdm
 from egovcp.artifact import require_same_returns, save_artifact
 from egovcp.cli import preset_defaults, run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
+from egovcp.entry_point import raise_interrupt
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
 from egovcp.manifest import finite_or_null
@@ -112,8 +113,9 @@ def train(config: TrainConfig) -> None:
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
-    with reporting_full_memory(), stop_on_signal([signal.SIGTERM]) as received:
-        received.append(signal.SIGTERM)  # so that the first one raises KeyboardInterrupt
+    with reporting_full_memory(), ExitStack() as stack:
+        previous = signal.signal(signal.SIGTERM, raise_interrupt)
+        stack.callback(signal.signal, signal.SIGTERM, previous)
         is_converted, config = bool(config.features), convert_if_needed(config)
         with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
             run = _prepare_run(config, output, device, bf16)
@@ -321,8 +323,7 @@ class TrainingRun:
                 f"artifact: {artifact}",
                 f"continue: {PROG} --output_dir={self.output} --resume"
                 if stopped
-                else f"next: egovcp-eval --policy.path={artifact} --task={','.join(self.tasks)} "
-                "--output_dir=...",
+                else f"next: egovcp-eval --policy.path={artifact} --task=... --output_dir=...",
             ]
         )
 

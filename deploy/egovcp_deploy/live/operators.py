@@ -111,9 +111,9 @@ _KEYBOARD_HELP: Final = (
 )
 
 
-#: What a terminal sends for a key with Alt, an arrow or a function key. It ends before a space, so
-#: that no emergency stop is lost.
-_ESCAPE_SEQUENCE: Final = re.compile(r"\x1b+(\[+|O)?[\d;]*[^ ]?")
+#: What a terminal sends for a key with Alt, an arrow or a function key. It ends before space, h and
+#: q, so that no stop is lost. Its later parts, if they arrive alone, end with a capital: no key.
+_ESCAPE_SEQUENCE: Final = re.compile(r"\x1b+(\[+|O)?[\d;]*[^ hq]?")
 
 
 class KeyboardOperator:
@@ -130,7 +130,7 @@ class KeyboardOperator:
             if not (new := os.read(sys.stdin.fileno(), 4096)):
                 break
             typed += new
-        for key in _ESCAPE_SEQUENCE.sub("", typed.decode(errors="replace")).lower():
+        for key in _ESCAPE_SEQUENCE.sub("", typed.decode(errors="replace")):
             if key in _KEYS:
                 commands.append(_KEYS[key])
             elif key == "x":

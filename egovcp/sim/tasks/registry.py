@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import metadata
+from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
@@ -193,16 +194,25 @@ def register_task(reference: str) -> str:
 def plugin_failure(error: Exception) -> EnvironmentFailure | None:
     """The failure of the task in whose code, or whose robot's, ``error`` was raised; None: in that
     of no task but egovcp's own."""
-    modules: dict[str, type[BaseTask]] = {}
-    for task in (entry.task for entry in task_entries() if entry.task is not None):
-        for kind in (*task.__mro__, *getattr(task, "robot_class", task).__mro__):
-            modules.setdefault(kind.__module__, task)
-    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
-        module = frame.f_globals.get("__name__", "")
-        if module in modules and not module.startswith("egovcp."):
+    tasks = [entry.task for entry in task_entries() if entry.task is not None]
+    classes = {task: (task, getattr(task, "robot_class", task)) for task in tasks}
+    frames = reversed(list(traceback.walk_tb(error.__traceback__)))
+    for frame, line in [(f, n) for f, n in frames if not _module(f).startswith("egovcp.")]:
+        owner = frame.f_locals.get("self", frame.f_locals.get("cls"))
+        kind = owner if inspect.isclass(owner) else type(owner)
+        found = [task for task in tasks if kind in classes[task]] or [
+            task
+            for task in tasks
+            if _module(frame) in {base.__module__ for c in classes[task] for base in c.__mro__}
+        ]
+        if found:
             where = f"{os.path.basename(frame.f_code.co_filename)}, line {line}"
-            return modules[module].error(f"{type(error).__name__} in {where}: {error}")
+            return found[0].error(f"{type(error).__name__} in {where}: {error}")
     return None
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", ""))
 
 
 def installed_task(name: str) -> type[BaseTask] | None:

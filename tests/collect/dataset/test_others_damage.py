@@ -248,6 +248,20 @@ def test_a_damaged_episode_index_is_one_problem(
     assert text in error.problem
 
 
+def test_a_boundary_in_the_table_that_is_wrong_is_a_problem_of_the_table(
+    others: dict[str, Path], tmp_path: Path
+) -> None:
+    """Episodes 0 and 1 have 30 and 40 frames."""
+    root = Path(shutil.copytree(others["types"], tmp_path / "copy"))
+    columns = {"dataset_to_index": item(0, 31), "dataset_from_index": item(1, 31)}
+    of_table(**columns)(root)
+    of_table(length=lambda values: values.__setitem__(slice(0, 2), [31, 39]))(root)
+    problems = [error.problem for error in lerobot_problems(root)]
+    assert [p for p in problems if "frame_index" in p or "timestamp" in p] == []
+    assert any("gives it 31 frames, but it has 30" in problem for problem in problems)
+    assert any("gives it 39 frames, but it has 40" in problem for problem in problems)
+
+
 @pytest.mark.parametrize(
     ("damage", "problems"),
     [

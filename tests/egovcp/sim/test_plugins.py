@@ -307,6 +307,25 @@ def test_a_reference_to_the_class_of_an_installed_task_is_that_task() -> None:
     assert len([entry for entry in task_entries() if entry.name == "post"]) == 1
 
 
+def test_of_two_tasks_in_one_module_the_defective_one_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = "\n\nclass ATask(PostTask):\n    name = 'a'\n"
+    source = SOURCE.replace("place(self):", "place(self):\n        [][self.ticks_limit]") + other
+    install(tmp_path, "post", source, f"a = post_task:ATask\n{ENTRY}", monkeypatch)
+    env = VectorEnv(sim_config.EnvConfig(), 1, render_depth=False)
+    with pytest.raises(EnvironmentFailure, match=r"task post \(post_task:PostTask\): IndexError"):
+        env.reset([Scenario("post", 0, 0)])
+
+
+def test_an_error_of_the_library_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = VectorEnv(sim_config.EnvConfig(), 1, render_depth=False)
+    monkeypatch.setattr(VectorEnv, "_check", lambda env, scenarios: 1 // 0)
+    with pytest.raises(ZeroDivisionError) as caught:
+        env.reset([Scenario("ball", 0, 0)])
+    assert caught.value.__cause__ is None
+
+
 @pytest.mark.parametrize("result", ["[0.0] * 6", "[float('nan')] * 7", "1 / 0"])
 def test_a_defective_oracle_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, result: str
