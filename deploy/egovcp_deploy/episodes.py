@@ -58,10 +58,7 @@ class EpisodePlayer:
     environment and policy."""
 
     def __init__(
-        self,
-        config: EvalConfig,
-        artifact: Artifact | None = None,
-        stopped: Callable[[], bool] = lambda: False,
+        self, config: EvalConfig, artifact: Artifact | None, stopped: Callable[[], bool]
     ) -> None:
         self._config, self._artifact, self._stopped = config, artifact, stopped
         self._envs: dict[int, BaseVectorEnv] = {}
@@ -255,7 +252,7 @@ _player: EpisodePlayer  # of a worker process
 def _start(config: EvalConfig, stop: Event) -> None:
     global _player
     torch.set_num_threads(1)
-    _player = EpisodePlayer(config, stopped=stop.is_set)
+    _player = EpisodePlayer(config, None, stop.is_set)
 
 
 def _play_in_worker(group: EpisodeGroup) -> list[EpisodeScore]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -48,23 +48,19 @@ class StepResult:
     """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
 
 
-def naming_plugins[**P, R](function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate ``function``: an exception that the code of a plugin raises becomes an
-    `EnvironmentFailure` that names it and says what to do."""
-
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            return function(*args, **kwargs)
-        except EgovcpError:
+@contextmanager
+def reporting_plugin_errors() -> Iterator[None]:
+    """Turn an exception in the code of a plugin into an `EnvironmentFailure` that names it and says
+    what to do; also a decorator."""
+    try:
+        yield
+    except EgovcpError:
+        raise
+    except Exception as error:
+        failure = plugin_failure(error)
+        if failure is None:
             raise
-        except Exception as error:
-            failure = plugin_failure(error)
-            if failure is None:
-                raise
-            raise failure from error
-
-    return call
+        raise failure from error
 
 
 def one_robot(tasks: Iterable[str]) -> RobotSpec:
@@ -200,7 +196,7 @@ class BaseVectorEnv(ABC):
         """Whether ``position`` (3,), m, base frame, is within the range of the depth camera, and of
         the G1 also in front of the pelvis; the field of view is ignored."""
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def known_objects(self) -> NDArray[np.float32]:
         """(B, 4) position of each task's object, m, base frame, and 1; or zeros.
 
@@ -240,7 +236,7 @@ class BaseVectorEnv(ABC):
         """(B,) rows whose episode is over."""
         return np.array([instance.done for instance in self.instances])
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def reset(self, scenarios: Sequence[Scenario]) -> Observation:
         """Start an episode in every row."""
         if len(scenarios) != self.num_envs:
@@ -251,7 +247,7 @@ class BaseVectorEnv(ABC):
         self.instances = [self._instance(scenario) for scenario in scenarios]
         return self._begin(None)
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
         """Start a new episode in some rows, the others stay as they are."""
         if not self.instances:

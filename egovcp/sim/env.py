@@ -21,8 +21,8 @@ from egovcp.sim.base_env import (
     BaseVectorEnv,
     Observation,
     StepResult,
-    naming_plugins,
     one_robot,
+    reporting_plugin_errors,
 )
 from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.instance import EnvInstance, settle
@@ -119,7 +119,7 @@ class VectorEnv(BaseVectorEnv):
         self.controller.reset(self._controller_state, rows)
         return observation
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, 7) per row and let a planner tick (40 ms) pass."""
         live = ~self.done

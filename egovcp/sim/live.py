@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import DAMPING
-from egovcp.sim.base_env import naming_plugins
+from egovcp.sim.base_env import reporting_plugin_errors
 from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.robot import Proprioception, SimulatedRobot
@@ -121,7 +121,7 @@ class LiveRobot:
         self._standing = settle(config, controller)
         self._instance: EnvInstance | None = None
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def start(self, scenario: Scenario) -> None:
         """Hold the robot up in the scene of ``scenario``, with damped motors.
 
@@ -166,7 +166,7 @@ class LiveRobot:
         if self.phase is Phase.HELD:
             self.phase = Phase.FREE
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def begin(self) -> None:
         """Start the task around the robot at its current pose."""
         self.instance.task.place()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.base_env import BaseVectorEnv, naming_plugins
+from egovcp.sim.base_env import BaseVectorEnv, reporting_plugin_errors
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.base_task import BaseTask
 from egovcp.sim.tasks.registry import find_task
@@ -163,9 +163,10 @@ class Oracle(EnvPolicy):
         return np.array([_oracle_action(instance.task) for instance in env.instances])
 
 
-@naming_plugins
+@reporting_plugin_errors()
 def _oracle_action(task: BaseTask) -> Array:
     action = np.asarray(task.oracle(), np.float64)
     if action.shape != (task.robot_spec().action_dim,) or not np.isfinite(action).all():
-        raise task.error(f"its oracle returns {action.tolist()}, expected the numbers of an action")
+        expected = f"{task.robot_spec().action_dim} finite numbers"
+        raise task.error(f"its oracle returns {action.tolist()}, expected {expected}")
     return action

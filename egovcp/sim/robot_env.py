@@ -16,8 +16,8 @@ from egovcp.sim.base_env import (
     BaseVectorEnv,
     Observation,
     StepResult,
-    naming_plugins,
     one_robot,
+    reporting_plugin_errors,
     require_class,
 )
 from egovcp.sim.env import VectorEnv
@@ -129,7 +129,7 @@ class RobotEnv(BaseVectorEnv):
     def _instance(self, scenario: Scenario) -> RobotInstance:
         return RobotInstance(self.config, scenario)
 
-    @naming_plugins
+    @reporting_plugin_errors()
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Send one normalised action (B, A) per row and let a planner tick pass."""
         self._send(action, ~self.done)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView
-from egovcp.sim.base_env import BaseVectorEnv, Observation, naming_plugins
+from egovcp.sim.base_env import BaseVectorEnv, Observation, reporting_plugin_errors
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot_env import make_env
 from egovcp.sim.tasks.registry import find_task
@@ -96,7 +96,7 @@ class SimRobot:
         self.env.close()
 
 
-@naming_plugins
+@reporting_plugin_errors()
 def true_poses(env: BaseVectorEnv, row: int) -> tuple[NDArray[np.float64], tuple[Solid, ...]]:
     """Pose (7,) of the base and the scene of one robot, see `Tick`."""
     return env.instances[row].base_pose.copy(), env.instances[row].task.solids()

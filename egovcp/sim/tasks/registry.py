@@ -194,25 +194,28 @@ def register_task(reference: str) -> str:
 def plugin_failure(error: Exception) -> EnvironmentFailure | None:
     """The failure of the task in whose code, or whose robot's, ``error`` was raised; None: in that
     of no task but egovcp's own."""
-    tasks = [entry.task for entry in task_entries() if entry.task is not None]
-    classes = {task: (task, getattr(task, "robot_class", task)) for task in tasks}
-    frames = reversed(list(traceback.walk_tb(error.__traceback__)))
-    for frame, line in [(f, n) for f, n in frames if not _module(f).startswith("egovcp.")]:
-        owner = frame.f_locals.get("self", frame.f_locals.get("cls"))
-        kind = owner if inspect.isclass(owner) else type(owner)
-        found = [task for task in tasks if kind in classes[task]] or [
-            task
-            for task in tasks
-            if _module(frame) in {base.__module__ for c in classes[task] for base in c.__mro__}
-        ]
-        if found:
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        if task := _task_of(frame):
             where = f"{os.path.basename(frame.f_code.co_filename)}, line {line}"
-            return found[0].error(f"{type(error).__name__} in {where}: {error}")
+            return task.error(f"{type(error).__name__} in {where}: {error}")
     return None
 
 
-def _module(frame: FrameType) -> str:
-    return str(frame.f_globals.get("__name__", ""))
+def _task_of(frame: FrameType) -> type[BaseTask] | None:
+    """The task whose method, or whose robot's, a frame runs, else the first one that has a class in
+    its module; None for egovcp's own code."""
+    module = str(frame.f_globals.get("__name__", ""))
+    if module.startswith("egovcp."):
+        return None
+    owner = frame.f_locals.get("self", frame.f_locals.get("cls"))
+    own, near = owner if inspect.isclass(owner) else type(owner), None
+    for task in (entry.task for entry in task_entries() if entry.task is not None):
+        classes = (task, getattr(task, "robot_class", task))
+        if own in classes:
+            return task
+        if near is None and any(base.__module__ == module for c in classes for base in c.__mro__):
+            near = task
+    return near
 
 
 def installed_task(name: str) -> type[BaseTask] | None:
