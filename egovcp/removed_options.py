@@ -30,6 +30,7 @@ RENAMED_OPTIONS: Final[Mapping[str, str]] = {
     "policy.loss.foresight_every": "policy.loss.multistep_stride",
     "planner.process": "planner.action_parameterization",
     "robot.limits.picture_hold_s": "robot.limits.image_hold_s",
+    "train.compared_steps": "train.steps",
     "curriculum.few_falls": "curriculum.low_fall_rate",
     "curriculum.many_falls": "curriculum.high_fall_rate",
 }
@@ -51,6 +52,7 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     "format": "egovcp-export writes weights in half precision only: leave it out",
     "operator.gamepad": "use the robot's remote control, or --operator.type=keyboard",
     "robot.bridge.consistency": "readings are always checked for consistency: leave it out",
+    "train.max_minutes": "models are compared after equal steps: use --train.steps",
     "train.task_flags": "all tasks share one recipe: use --train.flags",
     "play.task_flags": "all tasks share one recipe: use --play.flags",
     "value_fit": "Q is trained with the world model and not fitted again afterwards: leave it out",

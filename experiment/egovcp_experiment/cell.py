@@ -25,6 +25,12 @@ PPO_POLICY: Final = "pretrained_model/ppo.safetensors"
 #: Result file of a study of this package.
 RESULT: Final = "result.json"
 
+#: Minutes of an episode with a controller other than the planner and PPO; that of `constant`
+#: includes its search.
+_EPISODE_MINUTES: Final = {"hold": 0.003, "random": 0.003, "oracle": 0.003, "constant": 0.03}
+#: Minutes of an episode of a study that simulates many variations of it.
+_STUDY_MINUTES: Final = {"residuals": 0.15}
+
 type Flags = Mapping[str, Any]
 """Name of a flag without dashes -> text, number, bool, list or mapping; references at any depth."""
 
@@ -77,6 +83,8 @@ class CellCommand:
     """Reads the metrics to store from the output folder."""
     digest: Callable[[Path], str]
     """SHA-256 of the outputs that other cells read."""
+    minutes: Callable[[Flags], float]
+    """Estimate of the time that it takes with these flags, min, on two cores of an x86 CPU."""
     resume_flags: Callable[[Path], Flags | None] = lambda folder: None
     """Flags that resume an interrupted run in the folder; None: start again."""
     packages: tuple[str, ...] = ()
@@ -186,6 +194,11 @@ def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
     return columns
 
 
+def _play_minutes(flags: Flags) -> float:
+    controllers = str(flags["controllers"]).split(",")
+    return float(flags["episodes"]) * sum(_EPISODE_MINUTES.get(c, 0.012) for c in controllers)
+
+
 def _resume_from_checkpoint(folder: Path) -> Flags | None:
     return {"resume": True} if (folder / "checkpoints" / "last").exists() else None
 
@@ -196,6 +209,7 @@ COLLECT: Final = CellCommand(
     output="dataset.root",
     figures=_collect_figures,
     digest=lambda folder: sha256(folder / HASHES_PATH),
+    minutes=lambda flags: 0.0012 * float(flags["episodes"]),
     resume_flags=lambda folder: {"resume": True},  # staged episodes are beside the folder
 )
 TRAIN: Final = CellCommand(
@@ -204,6 +218,7 @@ TRAIN: Final = CellCommand(
     output="output_dir",
     figures=_train_figures,
     digest=lambda folder: _artifact_digest(folder / ARTIFACT),
+    minutes=lambda flags: 0.0095 * float(flags["steps"]),
     resume_flags=_resume_from_checkpoint,
 )
 TRAIN_PPO: Final = CellCommand(
@@ -212,6 +227,7 @@ TRAIN_PPO: Final = CellCommand(
     output="output_dir",
     figures=_ppo_figures,
     digest=_ppo_digest,
+    minutes=lambda flags: 3e-5 * float(flags["steps"]),
     resume_flags=_resume_from_checkpoint,
     packages=("rsl_rl", "tensordict"),
 )
@@ -221,6 +237,7 @@ PLAY: Final = CellCommand(
     output="output_dir",
     figures=_eval_figures,
     digest=lambda folder: sha256(folder / "eval_run.json"),
+    minutes=_play_minutes,
 )
 
 
@@ -234,5 +251,6 @@ def study(name: str, exclusive: bool = False) -> CellCommand:
         output="output_dir",
         figures=lambda folder: dict(read_json(folder / RESULT)),
         digest=lambda folder: sha256(folder / RESULT),
+        minutes=lambda flags: _STUDY_MINUTES.get(name, 0.03) * float(flags.get("episodes", 100)),
         exclusive=exclusive,
     )

@@ -48,7 +48,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
         records = scheduler.records
         for command in dict.fromkeys(c.command for c in cells if c.name not in records):
             require_packages("egovcp-train", command.prog, *command.packages)
-        echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete")
+        echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete; {scheduler.outlook}")
         try:
             scheduler.run()
         finally:

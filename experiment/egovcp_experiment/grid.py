@@ -1,7 +1,7 @@
 """Cells for training flags x playing flags x tasks x seeds; equal runs are shared.
 
 collect-TASK-COUNT
-train-TASK-MODEL-sSEED     on the data of a task, or with the task `all` on that of all tasks
+train-all-MODEL-sSEED      on the data of all tasks; train-TASK-MODEL-sSEED: of one task
 play-TASK-VARIANT-sSEED    the planner with that model; `default` without changed flags
 bounds-TASK                hold, random and oracle on the same scenarios
 references-TASK            the same with constant, which needs an expensive search
@@ -30,12 +30,10 @@ from egovcp_experiment.cell import (
 )
 from egovcp_experiment.config import ExperimentConfig
 
-#: The task of a model that learns all tasks.
+#: Name of the model of several tasks, in place of a task.
 ALL: Final = "all"
 #: Name of a model or variant without changed flags, which all experiments share.
 DEFAULT: Final = "default"
-#: Name of the variant of the model of all tasks without changed flags.
-MIXED: Final = "mixed"
 #: Controllers of egovcp-eval that need neither a model nor a search.
 REFERENCES: Final = ("hold", "random", "oracle")
 
@@ -62,6 +60,12 @@ class Grid:
         self.collected = 1.0
         """Share of the configured episodes to collect."""
         self._cells: dict[str, Cell] = {}
+
+    @property
+    def trained_on(self) -> str:
+        """What the models of this configuration learn: `ALL`, or the only task."""
+        tasks = self.config.tasks
+        return ALL if len(tasks) > 1 else tasks[0]
 
     @property
     def cells(self) -> list[Cell]:
@@ -95,11 +99,6 @@ class Grid:
         extra = (*self.config.scenes, *config.flags)
         return CellOutput(self.add(Cell(f"collect-{task}-{episodes}", COLLECT, flags, extra)).name)
 
-    def compared(self, name: str, flags: Flags) -> Model:
-        """A model with equal steps and no time limit, so that slower models do not learn less."""
-        equal = {"steps": self.config.train.compared_steps, "max_minutes": 0}
-        return Model(name, {**equal, **flags})
-
     def model(
         self, task: str, seed: int, model: Model = _DEFAULT_MODEL
     ) -> CellOutput | ExternalPath:
@@ -119,9 +118,7 @@ class Grid:
         if len(tasks) > 1:
             data = {"datasets": [{"root": self.data(one)} for one in tasks]}
         flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
-        if config.max_minutes:
-            flags["max_minutes"] = config.max_minutes
-        flags = {**flags, **parse_flags(config.flags), **model.flags}
+        flags |= {**parse_flags(config.flags), **model.flags}
         return self.add(Cell(name or f"train-{task}-{model.name}-s{seed}", TRAIN, flags))
 
     def plays(
@@ -137,10 +134,10 @@ class Grid:
         Args:
             variant: part of the names, unless no flag is changed.
             flags: changed flags of egovcp-eval.
-            trained_on: task of the model; empty: the played one.
+            trained_on: task of the model; empty: all tasks.
         """
-        trained_on = trained_on or task
-        changed = flags or model.flags or trained_on != task
+        trained_on = trained_on or self.trained_on
+        changed = flags or model.flags or trained_on != self.trained_on
         names = []
         for seed in self.config.train.seeds:
             policy = {"controllers": "planner", "policy.path": self.model(trained_on, seed, model)}
@@ -164,11 +161,11 @@ class Grid:
     def study(
         self, name: str, task: str, flags: Flags, extra: Sequence[str] = (), exclusive: bool = False
     ) -> str:
-        """Name of the cell STUDY-TASK: a study of the task's first default model, with the planner
-        flags of egovcp-eval."""
+        """Name of the cell STUDY-TASK: a study of the first default model, with the planner flags
+        of egovcp-eval."""
         play = parse_flags(self.config.play.flags)
         planner = {flag: value for flag, value in play.items() if flag.startswith("planner.")}
-        policy = self.model(task, self.config.train.seeds[0])
+        policy = self.model(self.trained_on, self.config.train.seeds[0])
         cell = name if task == ALL else f"{name}-{task}"
         flags = {**planner, "policy.path": policy, **flags}
         return self.add(Cell(cell, study(name, exclusive), flags, tuple(extra))).name

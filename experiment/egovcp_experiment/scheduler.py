@@ -63,6 +63,21 @@ class CellScheduler:
         if self.failed:
             raise EnvironmentFailure(self._failure_message())
 
+    @property
+    def outlook(self) -> str:
+        """How many cells are left, and about how long they take: estimates of their commands,
+        scaled by the times of complete cells of the same command."""
+        factors = {}
+        for command in dict.fromkeys(cell.command for cell in self._cells):
+            done = [c for c in self._cells if c.command is command and c.name in self.records]
+            estimated = sum(command.minutes(cell.flags) for cell in done)
+            measured = sum(self.records[cell.name]["minutes"] for cell in done)
+            factors[command.prog] = measured / estimated if estimated else 1.0
+        left = [cell for cell in self._cells if cell.name not in self.records]
+        minutes = sum(c.command.minutes(c.flags) * factors[c.command.prog] for c in left)
+        spent = sum(process.minutes for process in self._running)
+        return f"{len(left)} to go, {_in_words(max(0.0, minutes - spent) / self._jobs)}"
+
     def _has_inputs(self, cell: Cell) -> bool:
         return all(name in self.records for name in cell.needs)
 
@@ -115,8 +130,7 @@ class CellScheduler:
 
     def _progress(self, cell: Cell, event: str) -> None:
         number = self._cells.index(cell) + 1
-        left = len(self._cells) - len(self.records)
-        self._log(f"cell {number} of {len(self._cells)}, {cell.name}: {event}; {left} to go")
+        self._log(f"cell {number} of {len(self._cells)}, {cell.name}: {event}; {self.outlook}")
 
     def _stop(self, stopped: Sequence[int]) -> None:
         """Interrupt all commands and wait for them, until a second signal."""
@@ -137,6 +151,10 @@ class CellScheduler:
             f"cell {name}{more} failed: {message}; see {log}. All cells that do not need it are "
             "complete; once the cause is fixed, the same command continues from here"
         )
+
+
+def _in_words(minutes: float) -> str:
+    return f"about {minutes / 60:.1f} h" if minutes >= 90 else f"about {max(1, minutes):.0f} min"
 
 
 def _last_line(log: Path) -> str:

@@ -33,7 +33,7 @@ from egovcp_experiment.config import (
     TrainingConfig,
 )
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.grid import ALL, Grid, Model, parse_flags
+from egovcp_experiment.grid import Grid, Model, parse_flags
 from egovcp_experiment.studies.residuals import ResidualsConfig
 
 CONFIGS = {
@@ -54,7 +54,7 @@ def test_variants_share_data_and_models() -> None:
     grid.plays("ball", "long", {"planner.horizon": 6})
     grid.plays("ball", "other", model=Model("other", {"policy.hidden": 64}))
     commands = [cell.command for cell in grid.cells]
-    assert (commands.count(COLLECT), commands.count(TRAIN), commands.count(PLAY)) == (1, 4, 6)
+    assert (commands.count(COLLECT), commands.count(TRAIN), commands.count(PLAY)) == (3, 4, 6)
 
 
 def test_every_cell_comes_after_those_it_needs() -> None:
@@ -72,28 +72,43 @@ def test_all_experiments_share_the_default_evaluation() -> None:
         for task in ("ball", "wall"):
             play = f"play-{task}-default-s0"
             assert found[name][play].flags == found["ppo"][play].flags
-    mixed = found["multitask"]["play-ball-mixed-s0"].flags
-    assert mixed["policy.path"] == CellOutput("train-all-default-s0", ARTIFACT)
-    assert found["generalise"]["play-ball-mixed-s0"].flags == mixed
+    play = found["generalise"]["play-ball-default-s0"]
+    assert play.flags == found["ppo"][play.name].flags
+    assert play.flags["policy.path"] == CellOutput("train-all-default-s0", ARTIFACT)
+    single = found["multitask"]["play-ball-single-s0"].flags
+    assert single["policy.path"] == CellOutput("train-ball-default-s0", ARTIFACT)
 
 
 def test_existing_data_and_policies_are_used() -> None:
     data = DataConfig(roots={"ball": "data/ball"})
-    grid = Grid(ExperimentConfig(data=data, train=TrainingConfig(policies={"wall": "a/wall"})))
-    grid.plays("ball")
+    training = TrainingConfig(seeds=(0,), policies={"all": "a/all"})
+    grid = Grid(ExperimentConfig(data=data, train=training))
+    grid.plays("ball", "single", trained_on="ball")
     grid.plays("wall")
     assert names(grid.cells) == [
         "train-ball-default-s0",
-        "play-ball-default-s0",
+        "play-ball-single-s0",
         "play-wall-default-s0",
     ]
     assert grid.cells[0].flags["dataset.root"] == ExternalPath("data/ball")
-    assert grid.cells[2].flags["policy.path"] == ExternalPath("a/wall")
+    assert grid.cells[2].flags["policy.path"] == ExternalPath("a/all")
 
 
-def test_the_multitask_model_reads_the_data_of_all_tasks() -> None:
-    grid = Grid(ExperimentConfig())
-    grid.plays("ball", "mixed", trained_on=ALL)
+def test_without_seeds_an_experiment_has_its_own() -> None:
+    def seeds(name: str, config: ExperimentConfig) -> set[int]:
+        cells = EXPERIMENTS[name].cells(config)
+        return {cell.flags["seed"] for cell in cells if cell.command is TRAIN}
+
+    small = SCALES["small"]()
+    assert seeds("table1", small) == seeds("sample-efficiency", small) == {0, 1, 2}
+    assert seeds("generalise", small) == {0}
+    given = replace(small, train=replace(small.train, seeds=(4, 5)))
+    assert seeds("table1", given) == seeds("generalise", given) == {4, 5}
+
+
+def test_models_read_the_data_of_all_tasks() -> None:
+    grid = Grid(ExperimentConfig(train=TrainingConfig(seeds=(0,))))
+    grid.plays("ball")
     train = next(cell for cell in grid.cells if cell.command is TRAIN)
     names = ("collect-ball-5400", "collect-wall-4000", "collect-arch-870")
     assert train.flags["datasets"] == [{"root": CellOutput(name)} for name in names]

@@ -87,6 +87,21 @@ def test_a_failure_stops_only_the_cells_that_need_it(
     assert diary.read_text().split() == ["a", "d", "a", "b", "c"]
 
 
+def test_the_time_that_is_left_is_estimated(cell: MakeCell, tmp_path: Path) -> None:
+    """By the estimates, then by how long complete cells took for theirs."""
+    cells = [cell("a", hours=2), cell("b", hours=3), cell("c", hours=1)]
+    store = CellStore(tmp_path / "out")
+    schedule = CellScheduler(cells, store, 1, lambda line: None)
+    assert schedule.outlook == "3 to go, about 6.0 h"
+    assert CellScheduler(cells, store, 2, lambda line: None).outlook == "3 to go, about 3.0 h"
+    store.records["a"] = {"minutes": 30.0}
+    assert schedule.outlook == "2 to go, about 60 min"
+    lines: list[str] = []
+    run([cell("d", hours=1), cell("e", hours=1)], tmp_path / "other", say=lines.append)
+    assert lines[0].endswith("d: begins; 2 to go, about 2.0 h")
+    assert lines[-1].endswith("; 0 to go, about 1 min")
+
+
 def test_independent_cells_run_in_parallel(cell: MakeCell, tmp_path: Path) -> None:
     """Each of two waits until it is interrupted: both have begun only if they run together."""
     cells = [cell("a", wait=60), cell("b", wait=60)]

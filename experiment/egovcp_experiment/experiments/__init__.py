@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from egovcp.errors import UsageError
@@ -35,6 +35,8 @@ class Experiment:
     """Requests all cells from the grid, and reports those that have results."""
     has_variants: bool = False
     """Whether ``--only`` and ``--most`` choose variants."""
+    seeds: tuple[int, ...] = (0,)
+    """Training seeds without ``--train.seeds``."""
 
     def cells(self, config: ExperimentConfig) -> list[Cell]:
         """All cells, each after those it needs: what a report without results requests.
@@ -46,13 +48,17 @@ class Experiment:
         if not self.has_variants and (config.only or most):
             option = "most" if most else "only"
             raise UsageError(f"--{option}: this experiment has no variants to choose; omit it")
-        grid = Grid(config)
+        grid = self._grid(config)
         self.make(grid, {})
         return grid.cells
 
     def report(self, config: ExperimentConfig, records: Records) -> ExperimentReport:
         """The report of the available results."""
-        return self.make(Grid(config), records)
+        return self.make(self._grid(config), records)
+
+    def _grid(self, config: ExperimentConfig) -> Grid:
+        seeds = config.train.seeds or self.seeds
+        return Grid(replace(config, train=replace(config.train, seeds=seeds)))
 
 
 EXPERIMENTS: Final[Mapping[str, Experiment]] = {
@@ -82,12 +88,15 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     ),
     "ppo": Experiment("learning curve of PPO, compared with the planner", ppo.report),
     "sample-efficiency": Experiment(
-        "success against the transitions that a model has seen (fig. 5)", sample_efficiency.report
+        "success against the transitions that a model has seen (fig. 5)",
+        sample_efficiency.report,
+        seeds=(0, 1, 2),
     ),
     "table1": Experiment(
         "horizons, ARWM, Rew-MPC and TD-MPC next to ours; tests of the paper's ordering (table I)",
         table1.report,
         has_variants=True,
+        seeds=(0, 1, 2),
     ),
     "variance": Experiment(
         "do the errors of Q along a plan average out, and predict the best horizon "

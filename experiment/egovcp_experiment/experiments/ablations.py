@@ -11,7 +11,7 @@ from typing import Final
 from egovcp.errors import UsageError
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
-from egovcp_experiment.grid import ALL, Grid
+from egovcp_experiment.grid import Grid, Model
 from egovcp_experiment.report import ExperimentReport, Table
 
 #: Ablations that are presets of egovcp-train.
@@ -44,11 +44,11 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         raise UsageError(
             f"--train.preset={config.train.preset}: ablations choose presets themselves; drop it"
         )
-    trained_on = ALL if len(config.tasks) > 1 else config.tasks[0]
+    trained_on = grid.trained_on
     trainings = {
         name: [
             grid.train(
-                trained_on, seed, grid.compared(name, flags), f"ablate-{trained_on}-{name}-s{seed}"
+                trained_on, seed, Model(name, flags), f"ablate-{trained_on}-{name}-s{seed}"
             ).name
             for seed in config.train.seeds
         ]
@@ -57,7 +57,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     page = ExperimentReport(
         "Ablations: effect of each design choice on held-out metrics",
         sections=[
-            f"Every model was trained for {config.train.compared_steps} gradient steps on the "
+            f"Every model was trained for {config.train.steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
             "(x): times below the error of repeating the last image, at that many ticks "
             "open-loop. `paper` is judged against its own returns, which differ from those of the "

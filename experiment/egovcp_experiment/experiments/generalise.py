@@ -12,7 +12,7 @@ from egovcp.sim.tasks.wall import WallConfig
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, MIXED, Grid
+from egovcp_experiment.grid import DEFAULT, Grid
 from egovcp_experiment.report import ExperimentReport, Table, percent
 
 #: The first condition of a task, which the others are compared with.
@@ -135,8 +135,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         planner: Scores = {}
         references: dict[str, Scores] = {}
         for name, flags in row.items():
-            variant = f"in_{name}" if flags else MIXED
-            plays = grid.plays(task, variant, flags, trained_on=ALL)
+            plays = grid.plays(task, f"in_{name}" if flags else DEFAULT, flags)
             scores = results.eval_scores(records, plays, task)
             cell = grid.references(task, f"references-{task}-{name}", flags, _REFERENCES)
             if scores is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from egovcp.eval_scores import EvalScores, points_range
 from egovcp_experiment import results
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, MIXED, Grid
+from egovcp_experiment.grid import ALL, Grid
 from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
 
 _LATENT_EPISODES: Final = 16  # per task
@@ -27,8 +27,8 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     levels: dict[str, dict[str, float]] = {}
     for task in config.tasks:
         plays = {
-            "single": grid.plays(task),
-            "mixed": grid.plays(task, MIXED, trained_on=ALL),
+            "single": grid.plays(task, "single", trained_on=task),
+            "mixed": grid.plays(task),
         }
         scores = results.all_scores(records, plays, task)
         cell = grid.references(task, f"references-{task}", controllers=_REFERENCES)
@@ -60,9 +60,9 @@ def _introduction(config: ExperimentConfig) -> str:
     given = [task for task in (*config.tasks, ALL) if task in config.train.policies]
     existing = f" except those given for {', '.join(given)} (`--train.policies`)" if given else ""
     return (
-        f"Every model{existing} was trained for {config.train.budget}: the one on mixed data "
-        f"learns {len(config.tasks)} tasks in the time that a single-task model has for one. Its "
-        "input does not name the task."
+        f"Every model{existing} was trained for {config.train.steps} gradient steps: the one on "
+        f"mixed data learns {len(config.tasks)} tasks in the steps that a single-task model has "
+        "for one. Its input does not name the task."
     )
 
 

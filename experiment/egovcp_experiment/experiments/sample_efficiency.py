@@ -1,6 +1,6 @@
 """Success and reward against the transitions that a model has seen (figure 5).
 
-Models are trained equally long on growing first parts of one dataset; PPO's curve is one training.
+Models of all tasks are trained equally long on growing first parts of the data.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
+from egovcp_experiment.cell import Flags
 from egovcp_experiment.experiments.ppo import ppo_scores, steps_per_episode, steps_text
 from egovcp_experiment.grid import REFERENCES, Grid, Model
 from egovcp_experiment.report import ExperimentReport, Part
@@ -28,17 +29,18 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
         sections=[
-            f"Every model was trained for {config.train.budget} on the first episodes of one "
-            "random dataset, whatever their number; a twentieth of them is held out. The "
-            "model-free baseline (PPO, dashed) collects its transitions while it learns: its curve "
-            "is one training."
+            f"Every model was trained for {config.train.steps} gradient steps on the first "
+            "episodes of each task, whatever their number; a twentieth of them is held out. "
+            "Transitions are those of one task. The model-free baseline (PPO, dashed) learns one "
+            "task and collects its transitions while it learns; its curve is that of its "
+            f"{len(config.train.seeds)} trainings."
         ],
     )
     tables: list[Part] = []
     curves: list[results.Curve] = []
     ppo_curves: list[results.Curve] = []
+    models = {part: _model(grid, part) for part in sorted(config.data.parts)}
     for task in config.tasks:
-        models = {part: _model(grid, task, part) for part in sorted(config.data.parts)}
         plays = {part: grid.plays(task, m.name, model=m) for part, m in models.items()}
         references = grid.references(task)
         ppo = ppo_scores(grid, task, records)
@@ -68,15 +70,22 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     return page
 
 
-def _model(grid: Grid, task: str, part: float) -> Model:
-    """A model of the first episodes. That of all episodes is the default model of other
-    experiments, unless the user gave a policy or a dataset."""
-    config, episodes = grid.config, grid.episodes(task, part)
-    given = task in config.train.policies or task in config.data.roots
-    whole = episodes == grid.episodes(task) == grid.episodes(task, grid.collected)
+def _model(grid: Grid, part: float) -> Model:
+    """A model of the first episodes of each task. That of all episodes is the default model of
+    other experiments, unless the user gave a policy or a dataset."""
+    config, tasks = grid.config, grid.config.tasks
+    numbers = {task: grid.episodes(task, part) for task in tasks}
+    given = grid.trained_on in config.train.policies or set(tasks) & set(config.data.roots)
+    whole = all(
+        n == grid.episodes(t) == grid.episodes(t, grid.collected) for t, n in numbers.items()
+    )
     if whole and not given:
         return Model()
-    return Model(f"first_{episodes}", {"dataset.episodes": f"0:{episodes}"})
+    flags: Flags = {"dataset.episodes": f"0:{numbers[tasks[0]]}"}
+    if len(tasks) > 1:
+        parts = [{"root": grid.data(task), "episodes": f"0:{n}"} for task, n in numbers.items()]
+        flags = {"datasets": parts}
+    return Model(f"part_{part:g}", flags)
 
 
 def _conclusion(task: str, named: Mapping[str, EvalScores]) -> str:

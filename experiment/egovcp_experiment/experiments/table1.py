@@ -14,7 +14,7 @@ from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import REFERENCES, Grid
+from egovcp_experiment.grid import REFERENCES, Grid, Model
 from egovcp_experiment.report import ExperimentReport, Table, number, percent
 
 type Scores = dict[str, dict[str, EvalScores]]
@@ -150,7 +150,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     chosen = config.chosen(dict.fromkeys([*_FIRST, *ROWS]))
     plays = {
         task: {
-            name: grid.plays(task, name, row.play, grid.compared(row.model, MODELS[row.model]))
+            name: grid.plays(task, name, row.play, Model(row.model, MODELS[row.model]))
             for name, row in ROWS.items()
             if name in chosen
         }
@@ -226,10 +226,10 @@ def _introduction(config: ExperimentConfig) -> str:
         "of trainings in which a claim holds is given, too."
     )
     return (
-        f"All models were trained for {config.train.compared_steps} gradient steps on the same "
-        "data with a head for rewards (`--policy.loss.reward=1`), and differ in the flags of their "
-        "row only. Ours, Rew-MPC and TD-MPC with Q as in ours plan with the same "
-        f"model. All rows play the same scenarios. {chance}"
+        f"All models were trained for {config.train.steps} gradient steps on the data of all tasks "
+        "with a head for rewards (`--policy.loss.reward=1`), and differ in the flags of their row "
+        "only. Ours, Rew-MPC and TD-MPC with Q as in ours plan with the same model. All rows play "
+        f"the same scenarios. {chance}"
     )
 
 

@@ -23,7 +23,10 @@ from egovcp_experiment.experiments import EXPERIMENTS
 
 COUNT = 40
 CONFIG = ExperimentConfig(
-    tasks=("wall",), data=DataConfig(parts=(0.5, 1.0)), ppo=PpoBaselineConfig(steps=0)
+    tasks=("wall",),
+    data=DataConfig(parts=(0.5, 1.0)),
+    train=TrainingConfig(seeds=(0,)),
+    ppo=PpoBaselineConfig(steps=0),
 )
 
 
@@ -58,7 +61,7 @@ def test_more_data_is_judged_by_reward(reward: float, words: str) -> None:
 
 def test_parts_are_prefixes_of_one_dataset() -> None:
     data = DataConfig(parts=(2.0, 0.5))
-    config = ExperimentConfig(tasks=("ball",), data=data)
+    config = ExperimentConfig(tasks=("ball",), data=data, train=TrainingConfig(seeds=(0,)))
     cells = {c.name: c for c in EXPERIMENTS["sample-efficiency"].cells(config)}
     assert cells["collect-ball-10800"].flags["episodes"] == 10800
     parts = [c.flags["dataset.episodes"] for c in cells.values() if c.command is TRAIN]
@@ -66,11 +69,13 @@ def test_parts_are_prefixes_of_one_dataset() -> None:
 
 
 def test_a_given_policy_is_not_the_model_of_all_episodes() -> None:
-    training = TrainingConfig(policies={"ball": "a/ball"})
+    training = TrainingConfig(seeds=(0,), policies={"all": "a/all"})
     config = ExperimentConfig(tasks=("ball", "wall"), data=DataConfig(parts=(1.0,)), train=training)
     cells = EXPERIMENTS["sample-efficiency"].cells(config)
     trained = [cell.name for cell in cells if cell.command is TRAIN]
-    assert trained == ["train-ball-first_5400-s0", "train-wall-default-s0"]
+    assert trained == ["train-all-part_1-s0"]
+    (parts,) = (cell.flags["datasets"] for cell in cells if cell.command is TRAIN)
+    assert [part["episodes"] for part in parts] == ["0:5400", "0:4000"]
 
 
 def test_parts_are_those_of_a_given_dataset(tmp_path: Path) -> None:
