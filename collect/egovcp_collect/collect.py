@@ -79,6 +79,11 @@ def collect(config: CollectConfig, command: str = "") -> None:
     root = local_root(DatasetConfig(config.dataset.repo_id, config.dataset.root))
     with open_committer(root, provenance, config.shard_episodes, check_existing) as committer:
         missing = _missing_scenarios(config, committer)
+        if committer.committed > config.episodes:
+            echo(
+                f"{root} has {committer.committed} episodes, more than --episodes="
+                f"{config.episodes}; none is removed; `egovcp-dataset delete` can do that"
+            )
         if missing:
             require_disk_space(committer.root.parent, missing, config.env, config.shard_episodes)
         began = time.monotonic()

@@ -31,7 +31,7 @@ class OperatorOptions:
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Drive a robot with a policy at 25 Hz and record each rollout."""
+    """Drive a robot with a policy at the rate of its planner and record each rollout."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The policy; only for the controller `planner`."""

@@ -86,15 +86,15 @@ class Tick:
     state: Array
     """(74,) proprioception, `spec.STATE_SLICES`."""
     action_planned: Array
-    """(7,) action of the planner, box units."""
+    """(7,) action of the planner, in [-1, 1]."""
     action_sent: Array
-    """(7,) action after the safety filter, as sent to the robot, box units."""
+    """(7,) action after the safety filter, as sent to the robot, in [-1, 1]."""
     depth_reconstructed: Array | None = None
     """(48, 64) decoded from the posterior, m."""
     depth_imagined: Array | None = None
     """(K, 48, 64) decoded 1..K ticks ahead along the chosen plan, m."""
     plan: Array | None = None
-    """(N, 7) chosen actions, box units."""
+    """(N, 7) chosen actions, in [-1, 1]."""
     candidates: Candidates | None = None
     value: float | None = None
     """Objective of the chosen plan, return units."""

@@ -32,7 +32,7 @@ _BYTES: Final = 4
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Sampling-based model predictive control at 25 Hz; --preset=paper sets the paper's values."""
+    """Sampling-based model predictive control; --preset=paper sets the paper's values."""
 
     samples: int = bounded(64, least=1, most=2**20)
     """M, candidates per iteration."""

@@ -233,7 +233,7 @@ class LiveRobot:
                 outcome.contacts[part] = max(force, outcome.contacts.get(part, 0.0))
 
     def _pose(self) -> Array:
-        """(7,) the action that commands the robot's present pose, box units."""
+        """(7,) the action that commands the robot's present pose, in [-1, 1]."""
         pose = np.append(self.robot.palms_b.ravel(), self.robot.pelvis_height)
         return np.clip(ACTION_BOX.to_normalised(pose), -1.0, 1.0)
 

@@ -205,6 +205,8 @@ def test_resuming_a_complete_collection_changes_nothing(
     flags = [*_SHORT, *_SMALL, f"--dataset.root={ten}", "--resume"]
     assert main([*flags, "--episodes=10"]) == 0
     assert capsys.readouterr().out.startswith("10 episodes, ")
+    assert main([*flags, "--episodes=7"]) == 0
+    assert "has 10 episodes, more than --episodes=7; none is removed" in capsys.readouterr().out
     assert _tree(ten) == before
 
 

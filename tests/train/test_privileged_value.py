@@ -18,7 +18,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.testing import random_batch, toy_model
 from egovcp_train import privileged_value
 from egovcp_train.checkpoint import load_training_state
-from egovcp_train.config import PrivilegedValueConfig
+from egovcp_train.config import PRESETS, PrivilegedValueConfig
 from egovcp_train.loop import Budget
 from egovcp_train.privileged_value import Critic, Transitions
 from egovcp_train.train import main
@@ -76,6 +76,12 @@ def test_without_a_future_it_is_the_reward_of_object_and_action(store: EpisodeSt
     reward = value(*rows.inputs).detach()
     assert float((reward - rows.reward).square().mean() / rows.reward.var()) < 0.1
     assert float(_changes(value, rows, 6, 0.3).mean()) == pytest.approx(-0.3, abs=0.1)
+
+
+@pytest.mark.parametrize(("steps", "updates"), [(6000, 5000), (1000, 5000), (100, 500), (1, 5)])
+def test_a_short_run_has_a_short_fit(steps: int, updates: int) -> None:
+    config = dataclasses.replace(PRESETS["default"](), steps=steps)
+    assert config.critic_fit == PrivilegedValueConfig(updates=updates)
 
 
 def test_next_actions_are_those_of_the_planner() -> None:

@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +21,8 @@ from egovcp.testing import toy_model
 from egovcp_train import publish as publishing
 from egovcp_train.publish import main as push
 from egovcp_train.train import main as train
+from tests.support.arguments import Arguments
 from tests.support.hub import FakeHub, redirect_hub
-
-type Arguments = Callable[..., list[str]]
 
 REPO = "models/me/policy"
 TO_HUB = ("--policy.push_to_hub", "--policy.repo_id=me/policy")

@@ -1,7 +1,7 @@
 """The output folder of a run: its options, and checkpoints that are complete or absent.
 
 train_config.yaml                      the options of the run
-checkpoints/000500/pretrained_model/   the policy (averaged weights), in LeRobot's layout
+checkpoints/000500/pretrained_model/   the policy (moving average of weights), in LeRobot's layout
 checkpoints/000500/training_state/     weights, optimiser, random streams, data position, and
                                        their SHA-256
 checkpoints/last -> 000500

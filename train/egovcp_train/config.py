@@ -20,14 +20,16 @@ from egovcp.plan.config import PAPER_PLANNER, require_affordable
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.loggers import WandbConfig
 
+_FIT_UPDATES_PER_STEP: Final = 5
+
 
 @dataclass(frozen=True)
 class PrivilegedValueConfig:
     """Fit of the target of Q, see `egovcp_train.privileged_value`."""
 
     updates: int = bounded(5000, least=1, most=10_000_000)
-    """Updates before the training of the world model, for which a quarter of --max_minutes is
-    spent at most."""
+    """Updates before the training of the world model, at most five for each of its --steps;
+    a quarter of --max_minutes is spent on them at most."""
     rows: int = bounded(512, least=1, most=1_000_000)
     """Rows of an update."""
     lr: float = bounded(1e-3, above=0)
@@ -222,6 +224,12 @@ class TrainConfig:
         if self.policy.dynamics == "autoregressive":
             steps = self.policy.loss.autoregressive_steps
             require_longer(self.sampling.length, steps, "--sampling.length")
+
+    @property
+    def critic_fit(self) -> PrivilegedValueConfig:
+        """The fit of the critic, which is shorter if the run is short."""
+        fit = self.optimizer.privileged_value
+        return replace(fit, updates=min(fit.updates, _FIT_UPDATES_PER_STEP * self.steps))
 
 
 def default() -> TrainConfig:

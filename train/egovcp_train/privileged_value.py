@@ -349,7 +349,7 @@ def prepare(
     critic = fit(
         model,
         store,
-        config.optimizer.privileged_value,
+        config.critic_fit,
         config.planner,
         config.seed,
         progress,

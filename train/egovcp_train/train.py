@@ -140,8 +140,7 @@ def _prepare_run(
     if config.resume:
         spent, fit_seconds = _restore(output, learner, data)
     else:
-        updates = config.optimizer.privileged_value.updates
-        fitting = Budget(updates, _FIT_SHARE * config.max_minutes)
+        fitting = Budget(config.critic_fit.updates, _FIT_SHARE * config.max_minutes)
         learner.critic = privileged_value.prepare(learner.model, data, fitting.progress, bf16)
         spent = fit_seconds = fitting.spent
     budget = Budget(config.steps, config.max_minutes, spent=spent, fit_seconds=fit_seconds)

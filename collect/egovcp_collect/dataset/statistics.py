@@ -103,7 +103,7 @@ class ActionStatistics:
 
     @classmethod
     def of(cls, action: NDArray[np.floating]) -> Self:
-        """The statistics of actions (N, 7) in box units."""
+        """The statistics of actions (N, 7), in [-1, 1]."""
         counts = {
             name: np.histogram(action[:, i], HISTOGRAM_BINS, (-1.0, 1.0))[0]
             for i, name in enumerate(ACTION_NAMES)

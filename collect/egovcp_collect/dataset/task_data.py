@@ -50,7 +50,7 @@ class TaskRows:
     episodes: NDArray[np.int64]  # (E,) index in the dataset
     length: NDArray[np.int64]  # (E,) rows
     metadata: Sequence[Mapping[str, Any]]  # (E,)
-    action: NDArray[np.float32]  # (N, 7) box units
+    action: NDArray[np.float32]  # (N, 7), in [-1, 1]
     reward: NDArray[np.float32]  # (N,)
     reward_terms: NDArray[np.float32]  # (N, 6) `spec.REWARD_TERMS`; zeros if not recorded
     fallen: NDArray[np.bool_]  # (E,) the episode ended in a fall

@@ -35,7 +35,7 @@ class RobotObservation:
 class ActionResult:
     """Result of one action. A recording of a real robot contains only what was sent."""
 
-    sent: Array  # (7,) the action that took effect, box units
+    sent: Array  # (7,) the action that took effect, in [-1, 1]
     reward: float = 0.0
     reward_terms: Mapping[str, float] = field(default_factory=dict)
     terminated: bool = False

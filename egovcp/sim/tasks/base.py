@@ -53,7 +53,7 @@ class Task(BaseTask):
         (0.3, 0.6, 0.85),
         (0.0, -0.6),
     )
-    """Grid of the search for the best constant action: forward, outward, up, height; box units."""
+    """Grid of the search for the best constant action: forward, outward, up, height, in [-1, 1]."""
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
