@@ -56,7 +56,34 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         if scores:
             rows = {f"N = {n}": each for n, each in scores.items()}
             page.sections.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
+        play = {"task": task, "episodes": config.play.episodes}
+        cell = grid.sim_study("plan_terms", task, play)
+        if cell in records:
+            _add_terms(page, task, records[cell]["figures"])
     return page
+
+
+def _add_terms(page: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
+    """The mean of Q over a plan next to its first and its last term alone."""
+    scores = {
+        term: EvalScores(
+            np.array([row["reward"]]), np.array([row["steps"]]), np.array([row["success"]], float)
+        )
+        for term, row in found["terms"].items()
+    }
+    title = f"{task}: plans of N = {found['horizon']}, chosen by the mean of Q or by one term"
+    page.sections.append(results.comparison(title, scores, "mean"))
+    spread = ", ".join(f"{value / found['return_std']:.2f}" for value in found["spread"])
+    alone = ", ".join(
+        f"{term} term {scores[term].gain(scores['mean']).word()} ({scores[term].success_rate:.1%})"
+        for term in ("first", "last")
+    )
+    page.findings.append(
+        f"{task}: compared with the mean of Q over a plan ({scores['mean'].success_rate:.1%}), by "
+        f"reward: {alone}; over random plans the terms have standard deviations of {spread} of "
+        "that of the return"
+    )
+    page.figures[task]["terms"] = {**results.figures_of(scores), "spread": found["spread"]}
 
 
 def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:

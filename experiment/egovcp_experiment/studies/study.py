@@ -21,7 +21,7 @@ from egovcp.errors import UsageError
 from egovcp.files import user_path, write_json
 from egovcp.model import Carry
 from egovcp.outputs import require_writable
-from egovcp.plan import PolicyStep
+from egovcp.plan import Policy, PolicyStep
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.base_env import Observation, StepResult
@@ -150,14 +150,21 @@ class PlayedStep:
 
 
 def play_episodes(
-    artifact: Artifact, env_config: EnvConfig, config: SimStudyConfig
+    artifact: Artifact,
+    env_config: EnvConfig,
+    config: SimStudyConfig,
+    make_policy: Callable[[int, int], Policy] | None = None,
 ) -> Iterator[PlayedStep]:
-    """Play the scenarios of ``config`` in the scenes of ``env_config``, in groups of `_ENVS`."""
+    """Play the scenarios of ``config`` in the scenes of ``env_config``, in groups of `_ENVS`.
+
+    Args:
+        make_policy: number of robots, seed -> policy; None: that of the artifact.
+    """
     scenarios = [Scenario(config.task, STUDIES + config.seed, i) for i in range(config.episodes)]
     with tqdm(total=len(scenarios), unit="ep", desc=f"play {config.task}") as bar:
         for group in batched(scenarios, _ENVS):
             with closing(VectorEnv(env_config, len(group))) as env:
-                policy = artifact.make_policy(len(group), config.seed)
+                policy = (make_policy or artifact.make_policy)(len(group), config.seed)
                 observation = env.reset(group)
                 while not env.done.all():
                     decision = policy.act(observation.depth, observation.state)

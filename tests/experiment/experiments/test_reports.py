@@ -165,6 +165,28 @@ def test_multitask_names_the_models_that_were_not_trained() -> None:
     assert some.startswith("Every model except those given for ball, all (`--train.policies`) was")
 
 
+def test_variance_compares_single_terms_with_their_mean() -> None:
+    def term(reward: float, successes: int) -> Mapping[str, Any]:
+        success = [k < successes for k in range(20)]
+        return {"reward": [10 * reward] * 20, "steps": [10] * 20, "success": success}
+
+    figures = {
+        "task": "ball",
+        "horizon": 4,
+        "terms": {"mean": term(0.2, 18), "first": term(0.1, 9), "last": term(0.3, 20)},
+        "return_std": 0.5,
+        "spread": [0.05, 0.1, 0.15, 0.2],
+    }
+    found = EXPERIMENTS["variance"].report(
+        SCALES["small"](), {"plan_terms-ball": {"figures": figures}}
+    )
+    (line,) = found.findings
+    assert line.startswith("ball: compared with the mean of Q over a plan (90.0%), by reward: ")
+    assert "first term worse (45.0%), last term better (100.0%)" in line
+    assert "0.10, 0.20, 0.30, 0.40 of" in line
+    assert found.figures["ball"]["terms"]["last"]["success_rate"] == 1.0
+
+
 def test_ablations_name_the_best_choice() -> None:
     def record(r2: float) -> Mapping[str, Any]:
         errors = {str(k): {"model_mm": 1.0, "repeat_mm": 4.0} for k in (4, 8)}
