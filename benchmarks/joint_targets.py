@@ -68,6 +68,8 @@ def main() -> None:
     )
     p.add_argument("--seed", type=int, default=5, help="of the scenarios")
     args = p.parse_args()
+    if args.robots < 2:
+        p.error(f"--robots={args.robots}: expected at least 2")
     below = np.full(len(JOINT_NAMES), -np.inf)
     above = below.copy()
     for which in ("walk", "stance"):

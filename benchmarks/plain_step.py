@@ -152,14 +152,14 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     weight = pixel_weights(near, batch, loss)
     error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
     values = value_terms(model, h, z, batch)
-    foreseen = multistep_terms(model, (h, z), near, state, weight, batch, generator)
+    multistep_losses = multistep_terms(model, (h, z), near, state, weight, batch, generator)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
         loss.state * mean_where(error, batch.valid),
         loss.object * object_loss(model, features, batch.object, batch.valid & batch.object_known),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
         *values,
-        *foreseen,
+        *multistep_losses,
     ]
     return torch.stack(terms).sum()
 
@@ -242,17 +242,17 @@ def multistep_terms(
     first = int(torch.randint(every, (), generator=generator))
     start = torch.arange(first, length - min(horizons), every)
     h, z = (x[:, start] for x in states)
-    seen, rows, known = [], [], []
+    imagined, rows, known = [], [], []
     for k in range(1, max(horizons) + 1):
         start = start[start + k < length]
         h, z = h[:, : len(start)], z[:, : len(start)]
         h = model.transition(h, z, batch.action[:, start + k - 1])
         z = model.gaussian(model.prior(h))[0]
         if k in horizons:
-            seen.append(torch.cat([h, z], -1))
+            imagined.append(torch.cat([h, z], -1))
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
-    features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
+    features, at, valid = torch.cat(imagined, 1), torch.cat(rows), torch.cat(known, 1)
     image = model.decode_image(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
     depth = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
     proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)

@@ -37,7 +37,11 @@ SIDE = 1024  # of the matrices of the plain product
 def plain_plan(
     model: WorldModel, carry: Carry, executed: Tensor, config: PlannerConfig, seed: int
 ) -> Tensor:
-    """First action (7,) of the plan for one robot."""
+    """First action (7,) of the plan for one robot.
+
+    Only CEM with ``termination_rule=shift``: the action costs, mirrored plans and target actions of
+    the shipped planner are omitted.
+    """
     generator = torch.Generator().manual_seed(seed)
     m, n = config.samples, config.horizon
     mean, std = torch.zeros(n, spec.ACTION_DIM), torch.full((n, spec.ACTION_DIM), 3.0**-0.5)
@@ -85,21 +89,21 @@ def gpu_plans(
     """Name -> a plan's first action on a GPU; nothing without one."""
     if not torch.cuda.is_available():
         return {}
-    there, start = deepcopy(model).cuda(), executed.cuda()
+    gpu_model, last_action = deepcopy(model).cuda(), executed.cuda()
     state = carry.map(lambda x: x.cuda())
 
     def planned(evaluator: PlanEvaluator[Carry]) -> Callable[[], Tensor]:
         def run() -> Tensor:
             generator = torch.Generator("cuda").manual_seed(1)
             search = optimiser_of(config, "cuda")
-            plan = make_plan(evaluator, search, state, start, config, generator)
+            plan = make_plan(evaluator, search, state, last_action, config, generator)
             return plan.actions[0, 0].cpu()  # waits for it
 
         return run
 
     names: tuple[BackendName, ...] = ("eager", "float32")
     return {
-        f"gpu_{name}": planned(make_evaluator(there, replace(config, backend=name)))
+        f"gpu_{name}": planned(make_evaluator(gpu_model, replace(config, backend=name)))
         for name in names
     }
 
@@ -153,13 +157,13 @@ def main() -> None:
     depth = np.full((1, spec.DEPTH_ROWS, spec.DEPTH_COLS), 2000, np.uint16)
     state = np.zeros((1, spec.STATE_DIM), np.float32)
     seen = (torch.from_numpy(depth.astype(np.int32)), torch.from_numpy(state))
-    first = torch.zeros(1, dtype=torch.bool)
+    is_first = torch.zeros(1, dtype=torch.bool)
     products = plain_products()
     cases: dict[str, Callable[[], object]] = {
         **{f"plan_{name}": plan for name, plan in plans.items()},
         **on_gpu,
         "plain": plain,
-        "observe": lambda: model.observe(carry, executed, *seen, first),
+        "observe": lambda: model.observe(carry, executed, *seen, is_first),
         "command": lambda: policy.act(depth, state),
         **{f"product_{name}": product for name, product in products.items()},
     }

@@ -1,9 +1,9 @@
-"""Survival of a low-level controller in physics that it was not trained in.
+"""Survival of a low-level controller in physics outside or at the edge of the training ranges.
 
 Plays the skills of `egovcp-eval-lowlevel` in each variant, with the robots, commands and pushes
 of the reference (stock feet, 5 ms steps, the default ranges of `egovcp-eval-lowlevel
 --disturbances`). Prints the survival in the reference and, per variant, its difference in
-percentage points, * where it is more than 3 below; then the worst difference of each variant with
+percentage points, drops of more than 3 marked *; then the worst difference of each variant with
 its 95 % interval, paired by robot.
 
     python benchmarks/sim_to_sim.py --controller walk --episodes 400
@@ -30,7 +30,7 @@ from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.trial import play
 
 type Survived = NDArray[np.bool_]
-_STARRED_BELOW: Final = 3.0  # largest loss without a star, percentage points
+_MAX_DROP_POINTS: Final = 3.0  # larger drops are marked *
 _BATCH: Final = 200  # robots side by side
 _NOT_PLAYED: Final = ("still", "rest")  # robots that nothing disturbs
 
@@ -91,10 +91,10 @@ def difference(variant: Survived, reference: Survived) -> tuple[float, Interval]
 
 
 def row(name: str, values: Sequence[float], signed: bool = True) -> str:
-    """A line of the table; a star where a difference is too far below."""
+    """A line of the table; drops of more than `_MAX_DROP_POINTS` are marked *."""
     cells = []
     for value in values:
-        star = "*" if signed and value < -_STARRED_BELOW else " "
+        star = "*" if signed and value < -_MAX_DROP_POINTS else " "
         cells.append(f"{f'{value:+.1f}' if signed else f'{value:.1f}':>7}{star}")
     return f"{name:<15}" + "".join(cells)
 

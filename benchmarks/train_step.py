@@ -46,7 +46,6 @@ from egovcp.data import (
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
 from egovcp.model.privileged_value import PrivilegedValue
-from egovcp.plan import PlannerConfig
 from egovcp_train.config import OptimizerConfig, SamplingConfig
 from egovcp_train.datasets import set_normalisation, to_tensors
 from egovcp_train.device import choose_bf16, keep_freed_memory
@@ -62,6 +61,14 @@ BF16 = choose_bf16("auto", CPU)
 
 type Side = Literal["ours", "plain"]
 type Times = dict[str, tuple[float, float]]
+
+
+def add_critic(learner: Learner, batch: Batch) -> Learner:
+    """Let ``learner`` train a critic too; ``batch`` has the shapes and the device of the data."""
+    value = PrivilegedValue(batch.privileged.shape[-1]).to(batch.privileged.device)
+    lr = learner.config.privileged_value.training_lr
+    learner.critic = Critic(value, learner.planner, lr)
+    return learner
 
 
 class Learners:
@@ -100,10 +107,7 @@ class Learners:
     @cached_property
     def _with_critic(self) -> Learner:
         learner = Learner(copy.deepcopy(self._model), self._config, seed=0, bf16=BF16)
-        value = PrivilegedValue(self._batch.privileged.shape[-1])
-        lr = self._config.privileged_value.training_lr
-        learner.critic = Critic(value, PlannerConfig(), lr)
-        return learner
+        return add_critic(learner, self._batch)
 
     def first(self, side: Side) -> float:
         """Warm up every case with one step; returns its float32 loss."""

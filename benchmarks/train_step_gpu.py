@@ -5,12 +5,13 @@ Wall-clock times, including the wait for the GPU, for each number of windows:
 * ``step``: `egovcp_train.loop.Learner.update` on one batch in the GPU's memory, in the precision
   that ``egovcp-train`` takes there by itself (``bf16`` says which);
 * ``float32``: the same in float32;
-* ``data``: a step with its batch drawn from the stream and copied there, as in training;
+* ``critic``: ``step`` while the critic is trained too, as in `train_step.py`;
+* ``data``: ``step`` with its batch drawn from the stream and copied there, as in training;
 * ``cpu``: a step on one thread of the processor, in its own precision (``cpu_bf16``).
 
 The cases take turns, after the steps that are recorded as CUDA graphs (`egovcp.cuda_graphs`).
-``peak_memory_3_learners`` is the peak of GPU memory, with the learners of ``step``, ``float32`` and
-``data`` in it.
+``peak_memory_4_learners`` is the peak of GPU memory, with the learners of ``step``, ``float32``,
+``critic`` and ``data`` in it.
 
     python benchmarks/train_step_gpu.py --root data/ball
 """
@@ -24,6 +25,7 @@ from pathlib import Path
 
 import torch
 from report import interleaved, parser, publish
+from train_step import CRITIC_TRAINED, add_critic
 from writer import make_episode, write_dataset
 
 from egovcp.data import (
@@ -59,11 +61,15 @@ def cases(store: EpisodeStore, size: int, on_cpu: bool) -> dict[str, Callable[[]
     def batch(device: torch.device) -> Batch:
         return to_tensors(next(stream), device)
 
-    def stepping(device: torch.device, bf16: bool, fresh: bool = False) -> Callable[[], object]:
+    def stepping(
+        device: torch.device, bf16: bool, fresh: bool = False, critic: bool = False
+    ) -> Callable[[], object]:
         mine, kept = learner(device, bf16), batch(device)
+        if critic:
+            add_critic(mine, kept)
 
         def step() -> None:
-            mine.update(batch(device) if fresh else kept, 0.0)
+            mine.update(batch(device) if fresh else kept, CRITIC_TRAINED if critic else 0.0)
             if device.type == "cuda":
                 torch.cuda.synchronize()
 
@@ -77,6 +83,7 @@ def cases(store: EpisodeStore, size: int, on_cpu: bool) -> dict[str, Callable[[]
     found = {
         "step": stepping(GPU, own),
         "float32": stepping(GPU, bf16=False),
+        "critic": stepping(GPU, own, critic=True),
         "data": stepping(GPU, own, fresh=True),
     }
     return found | ({"cpu": stepping(CPU, choose_bf16("auto", CPU))} if on_cpu else {})
@@ -116,7 +123,7 @@ def main() -> None:
             out[f"frames_{size}_per_s"] = size * LENGTH / seconds["data"]
             if "cpu" in seconds:
                 out[f"cpu_ratio_{size}"] = seconds["cpu"] / seconds["step"]
-            out[f"peak_memory_3_learners_{size}_gb"] = torch.cuda.max_memory_allocated() / 1e9
+            out[f"peak_memory_4_learners_{size}_gb"] = torch.cuda.max_memory_allocated() / 1e9
             torch.cuda.reset_peak_memory_stats()
     publish(out, args.json)
 

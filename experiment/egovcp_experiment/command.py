@@ -68,7 +68,7 @@ def require_given(config: ExperimentConfig) -> None:
     Policies on the Hub are checked by their cells.
 
     Raises:
-        UsageError: a folder is not named.
+        UsageError: a folder is not named, or a dataset is of another task or robot.
         DataError: a dataset is missing or damaged.
         ArtifactError: a policy is missing or damaged.
     """
@@ -76,7 +76,13 @@ def require_given(config: ExperimentConfig) -> None:
         with _naming(f"--data.roots: {task}"):
             if not root:
                 raise UsageError("expected the folder of a dataset")
-            DatasetReader.open(DatasetConfig(root=root))
+            reader = DatasetReader.open(DatasetConfig(root=root))
+            tasks = sorted({reader.task(index) for index in range(len(reader))})
+            if not reader.robot.is_g1 or tasks != [task]:
+                raise UsageError(
+                    f"{root} holds {', '.join(tasks)} of robot {reader.robot.robot_type}; expected "
+                    f"{task} of the G1"
+                )
     for task, path in config.train.policies.items():
         with _naming(f"--train.policies: {task}"):
             if is_local_path(path):

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.destination import writer_lock
-from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.files import write_json
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.files import UnsafeFileError, read_json, write_json
 from egovcp.values import differences
 from egovcp_experiment.cell import (
     Cell,
@@ -30,13 +30,15 @@ from egovcp_experiment.cell import (
     Record,
     Reference,
     external_digest,
-    read_json,
     resolve,
     to_argv,
 )
 from egovcp_experiment.local_runner import versions
 
 _CELLS: Final = "cells"
+_LIMIT_BYTES: Final = 1 << 28  # of a result, which may hold images and maps
+#: Entries of a result that are read.
+_ENTRIES: Final = {"settings": dict, "sha256": str, "figures": dict, "minutes": float}
 
 
 class CellStore:
@@ -79,11 +81,12 @@ class CellStore:
 
         Raises:
             UsageError: the stored result has other settings.
+        DataError: it is damaged.
         """
         path = self._path(cell)
         if not path.exists():
             return False
-        record: Record = read_json(path)
+        record = _read_record(path)
         settings = self.settings(cell)
         if record["settings"] != settings:
             name, (before, now) = next(differences(record["settings"], settings))
@@ -162,3 +165,13 @@ class CellStore:
 
     def _figure(self, reference: CellFigure) -> Any:
         return reduce(getitem, reference.keys, self.records[reference.cell]["figures"])
+
+
+def _read_record(path: Path) -> Record:
+    try:
+        record = read_json(path, _LIMIT_BYTES)
+    except UnsafeFileError as error:
+        record = str(error)
+    if isinstance(record, dict) and all(isinstance(record.get(k), t) for k, t in _ENTRIES.items()):
+        return record
+    raise DataError(f"{path} is damaged; remove it to run its cell again")

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from egovcp import packages
+from egovcp.data import DatasetWriter, Provenance
+from egovcp.testing import random_episode
 from egovcp_experiment.command import main
 from egovcp_experiment.experiments import EXPERIMENTS
 
@@ -53,6 +55,7 @@ def test_help_shows_the_defaults_of_the_scale(
         (["table1", "--output_dir=x", "--train.policies={wal: y}"], "did you mean 'wall'"),
         (["table1", "--output_dir=x", "--train.steps=0"], "expected at least 1"),
         (["ablations", "--output_dir=x", "--train.preset=paper"], "--train.preset=paper"),
+        (["multitask", "--output_dir=x", "--tasks=[ball]"], "give at least two tasks"),
         (["variance", "--output_dir=x", "--only=[horizon_1]"], "--only: this experiment has no"),
         (["ppo", "--output_dir=x", "--scale=smoke", "--most=1"], "--most: this experiment has no"),
     ],
@@ -96,6 +99,19 @@ def test_a_dataset_or_policy_that_cannot_be_used_is_refused_before_any_cell_runs
     argv = ["table1", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]
     assert main([*argv, flag.format(folder=tmp_path)]) == code
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "out" / "logs").exists()
+
+
+def test_a_dataset_of_another_task_is_refused_before_any_cell_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset_root = tmp_path / "dataset"
+    with DatasetWriter(dataset_root, Provenance("walk-1", seed=0, command="collect")) as writer:
+        writer.add(random_episode(0))
+    argv = ["table1", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]
+    assert main([*argv, f"--data.roots={{wall: {dataset_root}}}"]) == 2
+    assert "--data.roots: wall: " in (err := capsys.readouterr().err)
+    assert "holds ball of robot unitree_g1; expected wall of the G1" in err
     assert not (tmp_path / "out" / "logs").exists()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp_experiment.cell import COLLECT, Cell, CellFigure, CellOutput, ExternalPath
 from egovcp_experiment.local_runner import CellProcess
 from egovcp_experiment.scheduler import CellScheduler
@@ -63,6 +63,14 @@ def test_other_settings_are_refused_before_anything_runs(
     with pytest.raises(UsageError, match=r"flags\.add was 1, is 2; name another --output_dir"):
         run([cell("new"), cell("a", add=2)], tmp_path / "out")
     assert diary.read_text().split() == ["a"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"settings": {}}', '{"settings": 1}'])
+def test_a_damaged_result_is_refused(cell: MakeCell, tmp_path: Path, text: str) -> None:
+    run([cell("a", add=1)], tmp_path / "out")
+    (tmp_path / "out" / "cells" / "a.json").write_text(text)
+    with pytest.raises(DataError, match=r"a\.json is damaged; remove it to run its cell again"):
+        run([cell("a", add=1)], tmp_path / "out")
 
 
 def test_other_content_of_a_given_file_is_refused(cell: MakeCell, tmp_path: Path) -> None:

@@ -31,7 +31,8 @@ _PRESS_HEIGHT: Final = 0.10  # m, above the pelvis
 
 @dataclass(frozen=True)
 class WallConfig(TaskConfig):
-    """A wall before the robot, which is pushed towards it; only hands may touch."""
+    """A wall in front of the robot; the robot is pushed towards it, and only the hands may touch
+    it."""
 
     distance_range: Range = bounded((0.60, 0.70), least=0.3, most=10)
     """Distance from pelvis to wall surface, m."""

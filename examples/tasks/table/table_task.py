@@ -23,13 +23,13 @@ from egovcp.sim.tasks import (
 )
 
 HALF = (0.35, 0.70, 0.02)  # m: depth, width, thickness of the top
-DT = 0.005  # s, of a physics step
 PUSH_TIME = 0.02  # s
 
 
 @dataclass(frozen=True)
 class TableConfig(TaskConfig):
-    """A table before the robot, which is pushed over its edge; only hands may touch."""
+    """A table in front of the robot; the robot is pushed towards its edge, and only the hands may
+    touch it."""
 
     distance_range: Range = bounded((0.32, 0.40), least=0.2, most=5)
     """Edge of the table before the pelvis, m."""
@@ -86,8 +86,10 @@ class TableTask(Task):
         data.mocap_quat[self._mocap] = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
 
     def before_step(self) -> None:
-        if 0.0 <= self.since_event + DT / 2 < PUSH_TIME:  # half a step of slack for rounding
-            bearing, part = self.parameters["bearing"], self.parameters["speed"] * DT / PUSH_TIME
+        step_s, _ = self.physics_clock()
+        if 0.0 <= self.since_event + step_s / 2 < PUSH_TIME:  # half a step of slack for rounding
+            bearing = self.parameters["bearing"]
+            part = self.parameters["speed"] * step_s / PUSH_TIME
             direction = np.array([math.cos(bearing), math.sin(bearing), 0.0])
             self.robot.data.qvel[:3] += part * (self.robot.heading @ direction)
 

@@ -39,7 +39,7 @@ class Experiment:
     """Training seeds without ``--train.seeds``."""
 
     def cells(self, config: ExperimentConfig) -> list[Cell]:
-        """All cells, each after those it needs: what a report without results requests.
+        """All cells in dependency order: those that a report without results requests.
 
         Raises:
             UsageError: an option is invalid for this experiment.
@@ -99,7 +99,7 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
         seeds=(0, 1, 2),
     ),
     "variance": Experiment(
-        "do the errors of Q along a plan average out, and predict the best horizon "
+        "do errors of Q average out along a plan, and does that predict the best horizon "
         "(section III-D)?",
         variance.report,
     ),

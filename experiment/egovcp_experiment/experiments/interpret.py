@@ -18,6 +18,7 @@ from egovcp_experiment.report import (
     percent,
     percent_range,
 )
+from egovcp_experiment.studies.behaviour import NEAR_NEUTRAL_M
 from egovcp_experiment.studies.open_loop import HORIZONS
 
 
@@ -50,7 +51,8 @@ def _add_value_maps(page: ExperimentReport, task: str, found: Mapping[str, Any])
         (name, str(row["episodes"]), f"{row['spread']:.3f}", f"{100 * row['height_error_m']:.1f}")
         for name, row in summary.items()
     ]
-    head = ("flight", "episodes", "best - worst (deviations of the return)", "height error (cm)")
+    spread = "best - worst (standard deviations of the return)"
+    head = ("flight", "episodes", spread, "height error (cm)")
     page.sections += [
         "Q of the planned action with the target of that hand moved over its x-z plane, all else "
         "equal. Height error: between the best point of the map and the height of the ball's aim.",
@@ -61,11 +63,17 @@ def _add_value_maps(page: ExperimentReport, task: str, found: Mapping[str, Any])
     if {"before", "75%"} <= summary.keys():
         before, late = summary["before"], summary["75%"]
         page.findings.append(
-            f"{task}: the value map of a hand spans {before['spread']:.2f} deviations "
+            f"{task}: the value map of a hand spans {before['spread']:.2f} standard deviations "
             f"of the return before the throw and {late['spread']:.2f} at 75 % of the flight; the "
             f"best point is {100 * before['height_error_m']:.0f} and "
             f"{100 * late['height_error_m']:.0f} cm off the ball's height"
         )
+
+
+def _edges(centres: Sequence[float]) -> tuple[float, float]:
+    """Outer edges of cells that are equally far apart."""
+    half = (centres[1] - centres[0]) / 2
+    return centres[0] - half, centres[-1] + half
 
 
 def _map_plot(found: Mapping[str, Any]) -> Plot:
@@ -78,7 +86,7 @@ def _map_plot(found: Mapping[str, Any]) -> Plot:
             image = at.imshow(
                 value,
                 origin="lower",
-                extent=(x[0], x[-1], z[0], z[-1]),
+                extent=(*_edges(x), *_edges(z)),
                 vmin=values.min(),
                 vmax=values.max(),
                 cmap="viridis",
@@ -148,7 +156,7 @@ _BEHAVIOUR: Final = {
     "after_throw": "distance of the hands from their start, after the throw (cm)",
     "empty_scene_effort": "mean squared action, no event (%)",
     "undisturbed_without_contact": "undisturbed scenes without contact",
-    "hands_back": "hands back within 10 cm and 2 s of recovery from a push",
+    "hands_back": "both hands within 10 cm of neutral at most 2 s after recovering from a push",
     "pelvis_far": "pelvis while no arch is near (cm)",
     "standing_far": "ticks above 0.70 m while no arch is near (%)",
     "pelvis_near": "pelvis while an arch is near (cm)",
@@ -174,11 +182,16 @@ def _add_behaviour(page: ExperimentReport, task: str, found: Mapping[str, Any]) 
 
 def _behaviour_conclusion(task: str, found: Mapping[str, Any]) -> list[str]:
     if task == "ball" and found["after_throw"]["mean"] is not None:
-        empty, after = found["empty_scene"]["mean"], found["after_throw"]["mean"]
-        word = "raised for the ball" if after > 1.5 * empty else "always raised"
+        empty, after = found["empty_scene"], found["after_throw"]
+        if empty["ci95"][0] > NEAR_NEUTRAL_M:
+            word = "raised in empty scenes, too"
+        elif after["ci95"][0] > empty["ci95"][1]:
+            word = "raised for the ball"
+        else:
+            word = "not raised"
         return [
-            f"ball: hands are {100 * empty:.0f} cm from their start in an empty scene, "
-            f"{100 * after:.0f} cm after a throw: {word}"
+            f"ball: hands are {100 * empty['mean']:.0f} cm from their start in an empty scene, "
+            f"{100 * after['mean']:.0f} cm after a throw: {word}"
         ]
     if task == "wall":
         untouched, back = found["undisturbed_without_contact"], found["hands_back"]

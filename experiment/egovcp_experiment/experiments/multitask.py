@@ -7,18 +7,24 @@ from typing import Any, Final
 
 import numpy as np
 
+from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores, points_range
 from egovcp_experiment import results
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, Grid
+from egovcp_experiment.grid import ALL, REFERENCES, Grid
 from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
 
 _LATENT_EPISODES: Final = 16  # per task
-_REFERENCES: Final = ("hold", "constant", "random", "oracle")
+_REFERENCES: Final = (*REFERENCES, "constant")
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
+    if len(config.tasks) < 2:
+        raise UsageError(
+            f"--tasks=[{', '.join(config.tasks)}]: the model of a single task equals that of all; "
+            "give at least two tasks"
+        )
     page = ExperimentReport(
         "Multi-task: one model on mixed data against one for each task",
         sections=[_introduction(config)],

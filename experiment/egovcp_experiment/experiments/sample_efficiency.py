@@ -26,15 +26,20 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             f"--data.parts={list(config.data.parts)}: parts of the dataset given for {given[0]} "
             f"(--data.roots) are at most 1; give --data.parts={parts}"
         )
+    introduction = (
+        f"Every model was trained for the same number of gradient steps ({config.train.steps}) on "
+        "growing first parts of the data; a twentieth of each part is held out. Transitions are "
+        "those of one task."
+    )
+    if config.ppo.transitions:
+        count = len(config.train.seeds)
+        introduction += (
+            " The model-free baseline (PPO, dashed) learns one task and collects its transitions "
+            f"while it learns; its curve is that of {count} training{'s' * (count > 1)}."
+        )
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
-        sections=[
-            f"Every model was trained for {config.train.steps} gradient steps on the first "
-            "episodes of each task, whatever their number; a twentieth of them is held out. "
-            "Transitions are those of one task. The model-free baseline (PPO, dashed) learns one "
-            "task and collects its transitions while it learns; its curve is that of its "
-            f"{len(config.train.seeds)} trainings."
-        ],
+        sections=[introduction],
     )
     tables: list[Part] = []
     curves: list[results.Curve] = []
@@ -97,5 +102,5 @@ def _conclusion(task: str, named: Mapping[str, EvalScores]) -> str:
     word = gain.word("more data helps", "more data hurts", "no clear difference")
     return (
         f"{task}: {first.success_rate:.1%} success from {names[0]}, {last.success_rate:.1%} from "
-        f"{names[-1]}: {word} ({gain})"
+        f"{names[-1]}: by reward, {word} ({gain})"
     )

@@ -2,6 +2,11 @@
 
 Starts after a ball has been in flight for a few frames, after a push, or on the way to an arch, and
 imagines under the actions that were sent.
+
+Depth errors are mean absolute differences in m over the valid pixels of the target frame, whose
+small holes are closed; empty predictions count as the end of the range. So they are defined as in
+``egovcp-eval-model``, except for moving pixels: here they differ from the last observed image,
+there from the frame before.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ from numpy.typing import NDArray
 from egovcp.artifact import Artifact
 from egovcp.eval_scores import Array
 from egovcp.model import Carry, WorldModel
+from egovcp.model.depth import nearness, to_metres
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_DT
 from egovcp_experiment.studies import study
 
@@ -48,14 +54,17 @@ def measure(config: OpenLoopConfig) -> None:
     clips = [clip for _, clip in recorded if len(clip.depth) > HORIZONS[-1]]
     shape = (len(clips), len(HORIZONS), DEPTH_ROWS, DEPTH_COLS)  # also without clips
     imagined = np.reshape([_imagine(artifact.world_model, clip) for clip in clips], shape)
-    seen = np.reshape([[clip.depth[k] for k in HORIZONS] for clip in clips], shape) / 1e3
+    depth = np.reshape([[clip.depth[k] for k in HORIZONS] for clip in clips], (-1, *shape[2:]))
+    max_m = artifact.world_model.config.depth_max_m
+    near = nearness(torch.from_numpy(depth.astype(np.int32)), max_m)
+    seen = to_metres(near, max_m).double().numpy().reshape(shape)
     moving = abs(seen[:, 1:] - seen[:, :1]) > _MOVING_M
     most_moving = np.argsort(-moving.mean(axis=(1, 2, 3)), kind="stable")[:_SHOWN]
     config.write(
         {
             "episodes": len(clips),
             "errors_m": {
-                str(k): _errors(imagined[:, i], seen[:, i], seen[:, 0])
+                str(k): _errors(imagined[:, i], seen[:, i], seen[:, 0], max_m)
                 for i, k in enumerate(HORIZONS)
             },
             "strips": [
@@ -93,10 +102,11 @@ def _imagine(model: WorldModel, clip: _Clip) -> Array:
     return np.stack(images)
 
 
-def _errors(model: Array, truth: Array, last: Array) -> dict[str, float | None]:
-    """Mean absolute error over pixels in range, and over moving ones, of the model and of the last
-    observed image repeated; (C, H, W) m, 0: nothing in range."""
-    valid = (truth > 0) & (last > 0)
+def _errors(model: Array, truth: Array, last: Array, max_m: float) -> dict[str, float | None]:
+    """Errors over all valid pixels and over moving ones, of the model and of the last observed
+    image repeated; (C, H, W) m, 0: nothing in range."""
+    valid = truth > 0
+    model, truth, last = (np.where(x > 0, x, max_m) for x in (model, truth, last))
     moving = valid & (abs(truth - last) > _MOVING_M)
     return {
         "model": _mean(abs(model - truth), valid),

@@ -13,6 +13,7 @@ import pytest
 from egovcp_experiment.cell import ARTIFACT, COLLECT, PLAY, Cell, CellOutput
 from egovcp_experiment.config import SCALES
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.experiments.interpret import _edges
 from egovcp_experiment.report import ExperimentReport, Plot, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
 
@@ -185,6 +186,32 @@ def test_variance_compares_single_terms_with_their_mean() -> None:
     assert "first term worse (45.0%), last term better (100.0%)" in line
     assert "0.10, 0.20, 0.30, 0.40 of" in line
     assert found.figures["ball"]["terms"]["last"]["success_rate"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("empty", "after", "words"),
+    [
+        ((0.02, 0.04), (0.05, 0.09), "raised for the ball"),
+        ((0.02, 0.04), (0.03, 0.09), "not raised"),
+        ((0.25, 0.30), (0.40, 0.50), "raised in empty scenes, too"),
+    ],
+)
+def test_intervals_decide_whether_hands_are_raised(
+    empty: tuple[float, float], after: tuple[float, float], words: str
+) -> None:
+    figures: dict[str, Any] = {
+        name: {"mean": sum(ci95) / 2, "ci95": list(ci95), "episodes": 20}
+        for name, ci95 in (("empty_scene", empty), ("after_throw", after))
+    }
+    found = EXPERIMENTS["interpret"].report(
+        SCALES["small"](), {"behaviour-ball": {"figures": figures}}
+    )
+    (line,) = found.findings
+    assert line.endswith(f"after a throw: {words}")
+
+
+def test_the_cells_of_a_value_map_are_around_their_centres() -> None:
+    assert _edges([0.0, 0.5, 1.0]) == (-0.25, 1.25)
 
 
 def test_ablations_name_the_best_choice() -> None:

@@ -54,9 +54,23 @@ def test_more_data_is_judged_by_reward(reward: float, words: str) -> None:
     ]
     records = {half: played(0.2, 0.9), whole: played(reward, 0.7)}
     (line,) = EXPERIMENTS["sample-efficiency"].report(CONFIG, records).findings
-    assert line.startswith("wall: 90.0% success from 200k steps, 70.0% from 400k steps: " + words)
+    assert line.startswith(
+        "wall: 90.0% success from 200k steps, 70.0% from 400k steps: by reward, " + words
+    )
     assert f"reward per step {reward - 0.2:+.5f}, 95 % " in line
     assert "success -20.0 points, " in line
+
+
+@pytest.mark.parametrize(
+    ("seeds", "steps", "words"),
+    [((0,), 64, "that of 1 training."), ((0, 1), 64, "of 2 trainings."), ((0, 1), 0, "one task.")],
+)
+def test_ppo_is_described_if_it_is_trained(seeds: tuple[int, ...], steps: int, words: str) -> None:
+    ppo, train = PpoBaselineConfig(steps=steps), TrainingConfig(seeds=seeds)
+    config = replace(CONFIG, ppo=ppo, train=train)
+    introduction = str(EXPERIMENTS["sample-efficiency"].report(config, {}).sections[0])
+    assert introduction.endswith(words)
+    assert ("PPO" in introduction) == bool(steps)
 
 
 def test_parts_are_prefixes_of_one_dataset() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from egovcp.model import Carry
@@ -21,6 +22,19 @@ def test_images_start_at_the_filtered_state(flags: list[str], tmp_path: Path) ->
         assert np.shape(strip["imagined"]) == np.shape(strip["seen"])
     assert found["errors_m"]["0"]["repeat"] == 0.0
     assert found["errors_m"]["8"]["model"] > 0.0
+
+
+def test_empty_predictions_count_as_the_end_of_the_range() -> None:
+    """Pixels: empty and rightly so, wrongly predicted as empty, moved before nothing, moved."""
+    model = np.array([[[0.0, 0.0, 4.0, 1.0]]])
+    truth = np.array([[[0.0, 4.5, 4.0, 2.0]]])
+    last = np.array([[[3.0, 4.5, 0.0, 1.0]]])
+    assert open_loop._errors(model, truth, last, max_m=5.0) == {
+        "model": pytest.approx((0.5 + 0 + 1) / 3),
+        "repeat": pytest.approx((0 + 1 + 1) / 3),
+        "model_moving": pytest.approx((0 + 1) / 2),
+        "repeat_moving": pytest.approx((1 + 1) / 2),
+    }
 
 
 def test_imagination_follows_the_actions_that_were_sent() -> None:

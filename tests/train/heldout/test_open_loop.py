@@ -21,8 +21,8 @@ from egovcp_train.heldout.open_loop import (
     OpenLoop,
     Strip,
     _regions,
-    most_interesting,
     strips,
+    top_strips,
 )
 from egovcp_train.heldout.pictures import calibration_picture, strip_picture
 from egovcp_train.heldout.report import Values
@@ -220,8 +220,8 @@ def test_episodes_too_short_for_a_strip_have_none(length: int) -> None:
 
 
 def test_few_strips_are_kept() -> None:
-    found = most_interesting([s._replace(interest=i) for i, s in enumerate(_strips(_still()) * 3)])
-    assert [s.interest for s in found] == [8, 7, 6]
+    found = top_strips([s._replace(moving_pixels=i) for i, s in enumerate(_strips(_still()) * 3)])
+    assert [s.moving_pixels for s in found] == [8, 7, 6]
     assert len(found) == MAX_STRIPS
 
 

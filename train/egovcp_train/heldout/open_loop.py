@@ -4,9 +4,9 @@ After at least `CONTEXT` filtered frames the state at row s is imagined forward 
 actions. At s + k the decoded image and proprioception are compared with the recorded ones; so are
 those of row s itself ("last image repeated").
 
-Depth errors are mean absolute differences in mm over the pixels of a region of row s + k with
-something in range; a prediction of nothing in range counts as the end of the range. State errors
-are mean absolute differences in standard deviations of the training data.
+Depth MAE, mm, over the valid pixels of the region in the target frame s + k; empty predictions
+count as the end of the range. Moving pixels differ from the frame before. MAE of the state in
+standard deviations of the training data.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class OpenLoop:
         for k in range(1, max(HORIZONS) + 1):
             carry = model.imagine(carry, batch.action[:, (s + k - 1).clamp_max(last)])
             if k in HORIZONS:
-                exists = batch.valid[:, (s + k).clamp_max(last)] & (s + k <= last)
-                b, i = torch.nonzero(exists, as_tuple=True)
+                in_episode = batch.valid[:, (s + k).clamp_max(last)] & (s + k <= last)
+                b, i = torch.nonzero(in_episode, as_tuple=True)
                 self._compare(model, _rows(carry, b, i), rollout, regions, b, s[i], k)
 
     def _compare(
@@ -76,16 +76,16 @@ class OpenLoop:
         k: int,
     ) -> None:
         """Add the errors of ``carry``, predicted from rows ``start`` of episodes ``b``."""
-        then = start + k
-        truth, before = rollout.state[b, then], rollout.state[b, start]
+        target_row = start + k
+        truth, last_observed = rollout.state[b, target_row], rollout.state[b, start]
         predicted = model.decode_state(carry.h, carry.z).float()
-        errors = torch.stack([(predicted - truth).abs().sum(0), (before - truth).abs().sum(0)])
-        self._state[k] += errors.double().cpu()
+        for i, state in enumerate((predicted, last_observed)):
+            self._state[k][i] += (state - truth).abs().sum(0).double().cpu()
         self._rows[k] += len(b)
         scale = torch.tensor([1e3 * model.config.depth_max_m] * 2 + [1.0])
-        for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
-            bs, ts = b[some], then[some]
-            image = model.decode_near(_rows(carry, some)).clamp(0.0, 1.0)
+        for chunk in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
+            bs, ts = b[chunk], target_row[chunk]
+            image = model.decode_near(_rows(carry, chunk)).clamp(0.0, 1.0)
             truth = rollout.near[bs, ts]
             error = (image - truth).abs()
             repeated = (rollout.near[bs, ts - k] - truth).abs()
@@ -138,7 +138,8 @@ def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
 class Strip(NamedTuple):
     """Recorded and predicted images of one prediction."""
 
-    interest: float
+    moving_pixels: float
+    """Number of moving pixels in the predicted rows."""
     start: int
     """Row of the last observed image."""
     observed: NDArray[np.float32]
@@ -147,13 +148,13 @@ class Strip(NamedTuple):
     """(len(STRIP), 48, 64) nearness."""
 
 
-def most_interesting(found: Sequence[Strip]) -> list[Strip]:
-    """The `MAX_STRIPS` most interesting ones."""
-    return sorted(found, key=lambda strip: -strip.interest)[:MAX_STRIPS]
+def top_strips(found: Sequence[Strip]) -> list[Strip]:
+    """The `MAX_STRIPS` strips with the most moving pixels."""
+    return sorted(found, key=lambda strip: -strip.moving_pixels)[:MAX_STRIPS]
 
 
 def strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[Strip]:
-    """The most interesting predictions of a batch of episodes, at most one per episode.
+    """Strips of the episodes in which most pixels move, at most one per episode.
 
     A strip starts before the rows in which most pixels move.
     """
@@ -164,17 +165,17 @@ def strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[Strip]:
     window[:, :-ahead] = moving[:, ahead:] - moving[:, :-ahead]
     rows = torch.arange(window.shape[1], device=window.device)
     possible = (rows >= CONTEXT - 1) & (rows <= latest[:, None])
-    interest, start = window.masked_fill(~possible, -1.0).max(1)
-    order = torch.argsort(-interest, stable=True)[:MAX_STRIPS]
+    most, start = window.masked_fill(~possible, -1.0).max(1)
+    order = torch.argsort(-most, stable=True)[:MAX_STRIPS]
     return [
-        _strip(model, batch, rollout, int(b), int(start[b]), float(interest[b]))
+        _strip(model, batch, rollout, int(b), int(start[b]), float(most[b]))
         for b in order
-        if interest[b] >= 0
+        if most[b] >= 0
     ]
 
 
 def _strip(
-    model: WorldModel, batch: Batch, rollout: Rollout, b: int, s: int, interest: float
+    model: WorldModel, batch: Batch, rollout: Rollout, b: int, s: int, moving: float
 ) -> Strip:
     states = [rollout.carry.map(lambda x: x[b, s][None])]
     for k in range(max(HORIZONS)):
@@ -182,4 +183,4 @@ def _strip(
     shown = Carry.join([states[k] for k in STRIP], torch.cat)
     predicted = model.decode_near(shown).clamp(0.0, 1.0)
     observed = rollout.near[b, [s + k for k in STRIP]]
-    return Strip(interest, s, observed.cpu().numpy(), predicted.cpu().numpy())
+    return Strip(moving, s, observed.cpu().numpy(), predicted.cpu().numpy())

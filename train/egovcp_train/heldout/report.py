@@ -21,7 +21,7 @@ from egovcp.model.privileged_value import PrivilegedValue, sample_actions
 from egovcp.model.value_losses import privileged_targets
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.datasets import to_tensors
-from egovcp_train.heldout.open_loop import OpenLoop, Strip, most_interesting, strips
+from egovcp_train.heldout.open_loop import OpenLoop, Strip, strips, top_strips
 
 EPISODES_AT_ONCE: Final = 16
 RANKED_ACTIONS: Final = 16
@@ -214,7 +214,7 @@ class TaskMeasurements:
         self.rows += int(batch.valid.sum())
         if open_loop:
             self.open_loop.add(model, batch, rollout)
-            self.strips = most_interesting([*self.strips, *strips(model, batch, rollout)])
+            self.strips = top_strips([*self.strips, *strips(model, batch, rollout)])
         self.termination.append(termination_rows(model, batch, rollout))
         self._values.append(self._compare(model, rollout.carry, batch))
         if model.object_head is not None:

@@ -81,27 +81,27 @@ def terms(
     rotation = rotation_matrix(x.quaternion)
     forward = heading(rotation)
     up = rotation[:, 2]  # the world's vertical in the pelvis frame
-    off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
-    on = standing_feet(x)
+    tilt_error = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
+    in_contact = standing_feet(x)
     feet = to_heading_xy(x.feet - x.position[:, None], forward)
-    ahead = to_heading_xy(x.feet_forward, forward)
+    foot_forward = to_heading_xy(x.feet_forward, forward)
     width = feet[:, 0, 1] - feet[:, 1, 1]
     torque = x.torque[:, :NU] / EFFORT_LIMIT[:NU]
     velocity_error = np.sum((motion[:, :2] - command[:, :2]) ** 2, axis=1)
-    slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * on
+    slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * in_contact
     return {
         "alive": np.ones(len(height)),
         "velocity": np.exp(-velocity_error / _VELOCITY_SCALE),
         "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / _TURNING_SCALE),
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / _HEIGHT_SCALE),
-        "upright": np.exp(-np.sum(off**2, axis=1) / _UPRIGHT_SCALE),
-        "contact": _feet_in_phase(on, walk.gait.phase, gait),
+        "upright": np.exp(-np.sum(tilt_error**2, axis=1) / _UPRIGHT_SCALE),
+        "contact": _feet_in_phase(in_contact, walk.gait.phase, gait),
         "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDING_SPEED) * ~pushed,
-        "torso_rate": np.minimum(_off_turning(torso.rate, command), _MAX_ROTATION),
+        "torso_rate": np.minimum(_torso_rate_error_sq(torso.rate, command), _MAX_ROTATION),
         "torso_change": np.minimum(np.sum(torso.change**2, axis=1), _MAX_ROTATION),
         "slip": np.sum(np.minimum(slipping, 4.0), axis=1),
         "stance_width": np.maximum(_MIN_WIDTH - width, 0.0),
-        "foot_heading": np.sum(ahead[..., 1] ** 2, axis=1),
+        "foot_heading": np.sum(foot_forward[..., 1] ** 2, axis=1),
         "action": np.sum(action**2, axis=1),
         "action_rate": np.sum((action - last_action) ** 2, axis=1),
         "torque": np.mean(torque**2, axis=1),
@@ -126,17 +126,17 @@ def finite_terms(
     return finite | {"fall": fell.astype(np.float64)}
 
 
-def _off_turning(rate: Array, command: Array) -> Array:
-    """(N,) rad^2/s^2, square of the torso's angular velocity off the commanded turning."""
-    off = rate.copy()
-    off[:, 2] -= command[:, 2]
-    return np.asarray(np.sum(off**2, axis=1))
+def _torso_rate_error_sq(rate: Array, command: Array) -> Array:
+    """(N,) rad^2/s^2, squared error of the torso's angular velocity; commanded: yaw rate only."""
+    rate_error = rate.copy()
+    rate_error[:, 2] -= command[:, 2]
+    return np.asarray(np.sum(rate_error**2, axis=1))
 
 
-def _feet_in_phase(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
+def _feet_in_phase(in_contact: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
     """Share of the feet that stand or swing as the phase requires; without a gait, all stand."""
     swing = np.stack([np.sin(phase), -np.sin(phase)], axis=1) * gait[:, None]
     either = np.abs(swing) < _SWING
     either &= gait[:, None] > _WALKING_GAIT
-    in_phase = np.where(either, True, on == (swing < _SWING))
+    in_phase = np.where(either, True, in_contact == (swing < _SWING))
     return np.asarray(np.mean(in_phase, axis=1))
