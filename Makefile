@@ -93,7 +93,7 @@ cards: install
 	  test -d $(CARDS)/$$task || egovcp-collect --task=$$task --episodes=$(CARD_EPISODES) --seed=0 \
 	    --dataset.root=$(CARDS)/$$task || exit 1; \
 	  egovcp-dataset card $(CARDS)/$$task --repo_id=egovcp/$$task \
-	    --output=dataset_cards/$$task.md --assets=assets/$$task || exit 1; \
+	    --output=dataset_cards/$$task.md || exit 1; \
 	done
 
 clean:

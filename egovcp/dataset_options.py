@@ -24,8 +24,8 @@ class SelectedDatasetConfig(DatasetConfig):
     """Dataset and selection of episodes."""
 
     episodes: str = ""
-    """Only these episodes: numbers, `[0, 5, 7]`, ranges without their end, `0:1334`, or
-    both, `[0:100, 250]`; empty: all."""
+    """Only these episodes: numbers, `[0, 5, 7]`, half-open ranges, `0:1334`, or both,
+    `[0:100, 250]`; empty: all."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """``--help`` of a command: its options in groups, with types, bounds and defaults.
 
-``--help`` shows the options outside groups and those of small groups, each with its first sentence,
-and lists the other groups. ``--help=GROUP`` shows one group in full, ``--help=all`` every option,
-and ``--help=flags`` one line per flag with the values to choose from, for shell completion.
+``--help`` shows the options outside groups and those of small groups, each with its first sentence
+and "..." if there are more, and lists the other groups. ``--help=GROUP`` shows one group in full,
+``--help=all`` every option, and ``--help=flags`` one line per flag with the values to choose from,
+for shell completion.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _COLUMN: Final = 40  # where descriptions start
 _SMALL_GROUP: Final = 4
 _SYNTAX: Final = (
     "Lists: [a, b] or (a, b). Groups: {name: value}. Quote both for the shell. --debug prints the "
-    "traceback of an error, --version the version."
+    "traceback of an error, --version the version. '...': shortened, see --help=all."
 )
 
 
@@ -42,7 +43,7 @@ class _Option:
 
     def row(self, full: bool) -> tuple[str, str]:
         """Flag with type, and description; only the first sentence unless ``full``."""
-        words = [self.text if full else self.text.partition(". ")[0].removesuffix(".") + "."]
+        words = [self.text if full else _first_sentence(self.text)]
         if self.bounds and full:
             words.append(f"[{self.bounds}]")
         if self.default is dataclasses.MISSING:
@@ -109,7 +110,7 @@ def _overview(groups: Sequence[_Group]) -> Iterator[str]:
         hidden = sum(len(g.options) for g in inner)
         if hidden and not group.is_short and group.name.rpartition(".")[0] in shown:
             count = f"{hidden} option{'s' if hidden > 1 else ''}"
-            rows.append((f"{group.name} ({count})", group.summary.partition(". ")[0]))
+            rows.append((f"{group.name} ({count})", _first_sentence(group.summary)))
     if rows:
         yield from ("", "More options, shown by --help=GROUP or --help=all:")
         yield from _table(rows)
@@ -174,6 +175,11 @@ def field_docs(config_class: type) -> Iterator[tuple[str, str]]:
                     ast.Expr(value=ast.Constant(value=str(text))),
                 ):
                     yield name, " ".join(text.split())
+
+
+def _first_sentence(text: str) -> str:
+    first, _, rest = text.partition(". ")
+    return f"{first} ..." if rest else text
 
 
 def _first_paragraph(config_class: type) -> str:

@@ -21,7 +21,7 @@ from egovcp.plan.config import (
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Which policy."""
+    """A local folder, a Hub id, or the name of a shipped policy."""
 
     path: str = ""
     """Folder of the artifact, its Hub id `user/name`, or `contact`, which ships with egovcp (a

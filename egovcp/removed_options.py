@@ -49,6 +49,7 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
         "--planner.action_rate_cost"
     ),
     **dict.fromkeys(("backend", "ray"), "all processes run on this machine: leave it out"),
+    "assets": "plots are written to assets/ beside the card: leave it out",
     "format": "egovcp-export writes weights in half precision only: leave it out",
     "operator.gamepad": "use the robot's remote control, or --operator.type=keyboard",
     "robot.bridge.consistency": "readings are always checked for consistency: leave it out",
@@ -82,6 +83,7 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
 #: Option that only some programs had -> these programs.
 PROGRAMS: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("backend", "ray"), ("egovcp-collect", "egovcp-experiment")),
+    "assets": ("egovcp-dataset",),
     "format": ("egovcp-export",),
     "network.activation": ("egovcp-train-lowlevel",),
     "realtime": ("egovcp-deploy",),

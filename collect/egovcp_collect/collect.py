@@ -154,8 +154,8 @@ def require_disk_space(
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise EnvironmentFailure(
-            f"{len(scenarios)} episodes need at least {needed} bytes below {folder}, where "
-            f"{free} bytes are free; free disk space, reduce --episodes, or choose another "
+            f"{len(scenarios)} episodes need at least {needed / 1e9:.1f} GB below {folder}, where "
+            f"{free / 1e9:.1f} GB are free; free disk space, reduce --episodes, or choose another "
             "--dataset.root"
         )
 

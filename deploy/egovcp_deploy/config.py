@@ -54,13 +54,14 @@ class DeployConfig:
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Rollouts in simulation, or recordings to replay; a unitree_g1 makes one."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Which held-out scenarios; on a unitree_g1, seed of the planner."""
+    """Seed of the planner's sampling and, in simulation, of the held-out scenarios."""
     output_dir: str = ""
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)
     """Logs besides the MCAP file."""
     imagine: int = bounded(16, least=0, most=1000)
-    """Horizon of the predicted depth images in the recordings, steps of 40 ms; 0: none."""
+    """Horizon of the predicted depth images in the recordings, planner steps (of 40 ms for the G1);
+    0: none."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.bounds import as_flag_value
+from egovcp.decode import decode
 from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError, read_json
 from egovcp.flags import merged
@@ -47,7 +48,7 @@ def reference(name: str, action: Action = ()) -> EnvPolicy:
 
 class ReferencePolicy:
     """Adapts an `EnvPolicy` to `RolloutPolicy`: it acts on the environment, not on observations;
-    ``scenarios()`` are those of the present episodes."""
+    ``scenarios()`` returns the scenarios of the current episodes."""
 
     def __init__(
         self, policy: EnvPolicy, env: BaseVectorEnv, scenarios: Callable[[], Sequence[Scenario]]
@@ -79,25 +80,25 @@ class ReferencePolicy:
 class BestConstant:
     """Result of the search."""
 
-    action: Action
+    action: tuple[float, ...]  # not `Action`, which `decode` does not know
     reward_mean: float  # per step, on the scenarios of the search
     success_rate: float
     episodes: int  # scenarios that it played
 
 
-def grid(task: str) -> list[Action]:
-    """Candidates: `BaseTask.constant_actions`, and the neutral pose."""
+def candidate_actions(task: str) -> list[Action]:
+    """`BaseTask.constant_actions`, and the neutral pose."""
     kind = find_task(task)
     neutral = (0.0,) * kind.robot_spec().action_dim
     return [neutral, *kind.constant_actions()]
 
 
 def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
-    """The action of the grid with the highest mean reward per step, by successive halving.
+    """The candidate action with the highest mean reward per step, by successive halving.
 
     Every candidate plays the same few scenarios; the best quarter play more of them, until one is
     left. No evaluation plays these scenarios."""
-    scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
+    scores: dict[Action, list[EpisodeScore]] = {action: [] for action in candidate_actions(task)}
     candidates, count = list(scores), _FIRST_ROUND
     while len(candidates) > 1 or not scores[candidates[0]]:
         first = len(scores[candidates[0]])
@@ -140,9 +141,9 @@ def load_constants(path: Path, setting: Mapping[str, Any]) -> dict[str, BestCons
     return constants
 
 
-def _parse(task: str, entry: dict[str, Any]) -> BestConstant:
-    action = tuple(float(value) for value in entry["action"])
+def _parse(task: str, entry: Any) -> BestConstant:
+    constant = decode(BestConstant, entry, f"constants.{task}")
     size = find_task(task).robot_spec().action_dim if task in task_names() else ACTION_DIM
-    if len(action) != size or not np.all(np.abs(action) <= 1.0):
-        raise ValueError(f"expected {size} numbers from -1 to 1, found {action}")
-    return BestConstant(**entry | {"action": action})
+    if len(constant.action) != size or not np.all(np.abs(constant.action) <= 1.0):
+        raise ValueError(f"expected {size} numbers from -1 to 1, found {constant.action}")
+    return constant

@@ -41,7 +41,7 @@ class DemoConfig:
     task: str = "sequence"
     """Scene: sequence (arch, ball and wall in turn), or another name from `egovcp-task list`."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Number of the held-out scenario."""
+    """Seed of the held-out scenario and of the planner's sampling."""
     live: str = ""
     """Also show the episode as it is played: web (a page for browsers), or spawn (the Rerun
     viewer)."""

@@ -24,9 +24,9 @@ _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
     "Writes rollout-<i>.mcap, rollout-<i>.rrd, pictures of the first rollouts, and deploy.json, "
     "which summarises the complete rollouts, also after an interrupt. On a robot the first Ctrl-C "
-    "holds it, the second damps its motors: a standing robot sinks. With --operator.duration the "
-    "first one also ends the run, 2 s later. Exit code 6: the robot was held or damped because "
-    "something failed."
+    "holds it, the second damps its motors: a standing robot collapses to the floor. With "
+    "--operator.duration the first one also ends the run, 2 s later. Exit code 6: the robot was "
+    "held or damped because something failed."
 )
 
 

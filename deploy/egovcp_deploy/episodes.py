@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -23,7 +23,7 @@ from egovcp.hardware import available_cores
 from egovcp.log.picture import AHEAD, PictureSink
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.plan import Policy, PolicyStep, blank_observation
-from egovcp.policy_options import load_policy
+from egovcp.policy_options import PolicyOptions, load_policy
 from egovcp.rate import NS_PER_S
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.base_env import BaseVectorEnv, Observation
@@ -104,8 +104,8 @@ def play_group(
     env: BaseVectorEnv,
     policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
-    stopped: Callable[[], bool] = lambda: False,
-    videos: Sequence[Path] = (),
+    stopped: Callable[[], bool],
+    videos: Sequence[Path],
 ) -> list[EpisodeScore]:
     """Play one episode on each instance of ``env``; returns the scores of the episodes that ended.
 
@@ -133,7 +133,7 @@ def play_group(
             skipped += live & step.skipped
         sent = safety.filter(step.action)
         if live[: len(sinks)].any():
-            _draw(sinks, len(plan_ms) - 1, env, observation, policy, step, sent)
+            _log_tick(sinks, len(plan_ms) - 1, env, observation, policy, step, sent)
         result = env.step(sent)
         policy.advance(result.sent_action)
         rewards += np.where(live, result.reward, 0.0)
@@ -159,7 +159,7 @@ def play_group(
     ]
 
 
-def _draw(
+def _log_tick(
     sinks: Sequence[Sink],
     index: int,
     env: BaseVectorEnv,
@@ -191,7 +191,8 @@ def _draw(
 
 
 class EpisodePool:
-    """Plays groups in worker processes, each of which loads the policy; they last until `close`.
+    """Plays groups in worker processes, which last until `close`; each loads the policy from the
+    folder of ``artifact``, so that all have the same version.
 
     With one worker it plays in this process, with ``artifact``. After ``stopped()`` turns true,
     unfinished episodes are abandoned.
@@ -208,6 +209,8 @@ class EpisodePool:
         self._stopped = stopped
         context = multiprocessing.get_context("spawn")
         self._stop = context.Event()
+        if artifact is not None:
+            config = replace(config, policy=PolicyOptions(str(artifact.path.absolute())))
         self._executor = ProcessPoolExecutor(  # starts no process before the first `submit`
             self._workers, context, initializer=_start, initargs=(config, self._stop)
         )

@@ -94,7 +94,7 @@ class EvalConfig:
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0, below=SEEDS)
-    """Seed of the held-out scenarios."""
+    """Seed of the held-out scenarios and of the planner's sampling."""
     controllers: str = ",".join(DEFAULT_CONTROLLERS)
     """Separated by commas: planner, hold (neutral pose), constant (best fixed action), random (the
     paper's walk), oracle (scripted, uses the simulator's state), ppo (model-free PPO)."""

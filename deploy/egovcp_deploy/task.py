@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -177,7 +178,8 @@ def run_new(config: NewTaskConfig) -> None:
         for word, value in words.items():
             text, path = text.replace(word, value), path.replace(word, value)
         write_text(Path(folder) / path, text)
+    quoted = shlex.quote(str(folder))
     echo(
-        f"wrote {folder}; next:\n  pip install -e {folder}\n  egovcp-task check {name}\n"
-        f"  egovcp-task play {name} --output_dir=play-{name}\n  pytest {folder}"
+        f"wrote {folder}; next:\n  pip install -e {quoted}\n  egovcp-task check {name}\n"
+        f"  egovcp-task play {name} --output_dir=play-{name}\n  pytest {quoted}"
     )

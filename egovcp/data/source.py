@@ -143,8 +143,8 @@ def hub_cache() -> Path:
 def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> NDArray[np.int64]:
     """The selected ones of ``count`` episodes, ascending and unique; all if ``text`` is empty.
 
-    ``text`` holds numbers and ranges ``first:end`` without the end, separated by commas; either end
-    of a range may be omitted. A single number needs brackets: YAML reads an unquoted ``1:30`` as
+    ``text`` holds numbers and half-open ranges ``first:end``, separated by commas; either end of a
+    range may be omitted. A single number needs brackets: YAML reads an unquoted ``1:30`` as
     the number 90, which must not be taken for an episode. ``flag`` is the option, for messages.
     """
     inner = text.strip()
@@ -169,7 +169,7 @@ def _part(part: str, given: str, count: int) -> NDArray[np.int64]:
     if found is None:
         raise UsageError(
             f"{given}: {as_flag_value(part)!r} is not an episode; expected numbers, [0, 5, 7], a "
-            "range without its end, 0:1334, or both, [0:100, 250]"
+            "half-open range, 0:1334, or both, [0:100, 250]"
         )
     number, first, end = found.groups()
     start = int(number or first or 0)

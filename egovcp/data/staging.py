@@ -27,7 +27,7 @@ from egovcp.errors import DataError
 from egovcp.files import sha256
 from egovcp.robot_spec import G1, RobotSpec
 
-_RECORD: Final = b"egovcp.facts"
+_RECORD: Final = b"egovcp.facts"  # name in files of unfinished collections of older versions
 _STATS: Final = b"egovcp.stats"
 _ROBOT: Final = b"egovcp.robot"  # absent for the G1
 _NAME: Final = re.compile(r"(\d{9})-([0-9a-f]{64})\.arrow")

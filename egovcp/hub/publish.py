@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,7 +14,8 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.files import sha256
 from egovcp.hub.errors import LostUpdate, RepoType, hub_token
 from egovcp.hub.retry import RetryPolicy, call_hub
-from egovcp.outputs import output_file
+from egovcp.outputs import output_file, write_report
+from egovcp.terminal import echo
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
@@ -41,6 +42,21 @@ class PublishConfig:
     """Attempts and time limits of requests."""
     json: str = output_file()
     """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""
+
+    def publish(self, contents: Mapping[str, Content], title: str, **options: Any) -> str:
+        """Publish, print the commit, and write the report; returns the SHA of the commit.
+
+        Args:
+            title: title of the commit if ``message`` is empty.
+            options: further fields of `Publication`.
+        """
+        names = {"repo_id": self.repo_id, "branch": self.branch, "tag": self.tag}
+        options |= {**names, "message": self.message or title, "private": self.private}
+        published = publish(Publication(contents=contents, **options), self.network)
+        state = "is now" if published.new else "was already"
+        echo(f"{self.repo_id}@{self.branch} {state} {published.commit}")
+        write_report(self.json, {**names, **asdict(published)})
+        return published.commit
 
 
 class Content:

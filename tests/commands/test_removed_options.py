@@ -32,6 +32,7 @@ def test_no_option_of_a_command_is_listed_as_removed() -> None:
         ("egovcp-train-ppo", "--env.ball.pose_cost=0", "--env.pose_cost"),
         ("egovcp-eval-model", "--return_steps=16", "leave it out"),
         ("egovcp-collect", "--backend=ray", "leave it out"),
+        ("egovcp-dataset card", "--assets=plots", "leave it out"),
         ("egovcp-export", "--format=float16", "half precision only"),
         ("egovcp-deploy", "--realtime=true", "egovcp-fake-g1"),
     ],

@@ -14,7 +14,7 @@ from egovcp.errors import DataError, UsageError
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks import task_names
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.controllers import Action, grid, load_constants, search_constant
+from egovcp_deploy.controllers import Action, candidate_actions, load_constants, search_constant
 from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore
 
@@ -41,7 +41,7 @@ class Landscape:
 @pytest.mark.parametrize("task", task_names())
 @pytest.mark.parametrize("which", [0, 1, -1])
 def test_the_best_action_wins_under_noise_shared_by_all(task: str, which: int) -> None:
-    best = grid(task)[which]
+    best = candidate_actions(task)[which]
     land = Landscape(best, noise=5.0)
     found = search_constant(task, 0, land)
     assert found.action == best
@@ -50,13 +50,13 @@ def test_the_best_action_wins_under_noise_shared_by_all(task: str, which: int) -
 
 def test_a_grid_of_the_neutral_pose_alone_is_played(monkeypatch: pytest.MonkeyPatch) -> None:
     neutral = (0.0,) * ACTION_DIM
-    monkeypatch.setattr("egovcp_deploy.controllers.grid", lambda task: [neutral])
+    monkeypatch.setattr("egovcp_deploy.controllers.candidate_actions", lambda task: [neutral])
     found = search_constant("ball", 0, Landscape(neutral, noise=0.0))
     assert (found.action, found.episodes) == (neutral, 6)
 
 
 def test_candidates_play_the_same_scenarios_and_none_of_the_evaluation() -> None:
-    land = Landscape(grid("ball")[3], noise=1.0)
+    land = Landscape(candidate_actions("ball")[3], noise=1.0)
     search_constant("ball", 4, land)
     by_action: dict[Action, list[Scenario]] = {}
     for action, scenario in land.played:
@@ -70,7 +70,7 @@ def test_candidates_play_the_same_scenarios_and_none_of_the_evaluation() -> None
 
 @pytest.mark.parametrize("task", task_names())
 def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: str) -> None:
-    actions = np.array(grid(task))
+    actions = np.array(candidate_actions(task))
     assert np.abs(actions).max() <= 1.0
     np.testing.assert_array_equal(actions[:, [0, 2]], actions[:, [3, 5]])
     np.testing.assert_array_equal(actions[:, 1], -actions[:, 4])
@@ -78,10 +78,12 @@ def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: s
     assert (actions == 0).all(axis=1).sum() == 1
 
 
+ENTRY = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
+
+
 def test_constant_json_is_read_back(tmp_path: Path) -> None:
-    entry = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
     path = tmp_path / "constant.json"
-    path.write_text(json.dumps({"constants": {"ball": entry}}))
+    path.write_text(json.dumps({"constants": {"ball": ENTRY}}))
     assert load_constants(path, {})["ball"].action == (0.1,) * ACTION_DIM
 
 
@@ -103,6 +105,8 @@ def test_an_option_that_was_null_is_compared_and_a_later_one_is_not(tmp_path: Pa
         '{"constants": {"ball": 3}}',
         '{"constants": {"ball": {"action": [1, 2]}}}',
         '{"constants": {"ball": {"a": 0}}}',
+        f'{{"constants": {{"ball": {{"action": [{"9" * 400}]}}}}}}',
+        json.dumps({"constants": {"ball": ENTRY | {"episodes": "four"}}}),
     ],
 )
 def test_a_file_of_another_format_is_refused(tmp_path: Path, content: str | None) -> None:

@@ -13,8 +13,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from egovcp.artifact import load_artifact
 from egovcp.errors import SimulationDiverged
 from egovcp.plan.backends import library
+from egovcp.policy_options import PolicyOptions
 from egovcp.robot.stance import StanceController
 from egovcp.sim import robot
 from egovcp.sim.config import EnvConfig, EpisodeConfig
@@ -405,7 +407,7 @@ def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfi
         advance(sent)
 
     toppled.advance = push  # type: ignore[method-assign]
-    (score,) = episodes.play_group(env, toppled, scenarios, lambda: next(ticks) > 30)
+    (score,) = episodes.play_group(env, toppled, scenarios, lambda: next(ticks) > 30, ())
     assert (score.episode, score.terminated) == (1, True)
 
 
@@ -420,6 +422,17 @@ def test_a_closed_pool_has_closed_its_environments(
             list(pool.play([EpisodeGroup("hold", scenarios)] * 2))
         assert not closed
     assert [env.num_envs for env in closed] == [1, 2]
+
+
+def test_workers_load_the_version_that_was_loaded(
+    artifact_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A Hub id without a revision names another version after a push."""
+    started: dict[str, Any] = {}
+    monkeypatch.setattr(episodes, "ProcessPoolExecutor", lambda *_, **given: started.update(given))
+    EpisodePool(EvalConfig(PolicyOptions("me/policy", "main")), load_artifact(str(artifact_dir)))
+    config, _ = started["initargs"]
+    assert config.policy == PolicyOptions(str(artifact_dir))
 
 
 @pytest.mark.slow

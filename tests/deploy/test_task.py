@@ -37,6 +37,13 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "new"
 
 
+def test_the_next_commands_can_be_pasted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["new", "grip", f"--output_dir={tmp_path / 'with space'}"]) == 0
+    assert f"pip install -e '{tmp_path / 'with space'}'" in capsys.readouterr().out
+
+
 def test_list_names_tasks_and_what_provides_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Final
 
 from huggingface_hub import DatasetCard, DatasetCardData
 
-from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.data.provenance import source_provenances
+from egovcp.data.source import hub_cache
 from egovcp.errors import UsageError
 from egovcp.files import user_path, write_text
 from egovcp.help_text import field_docs
@@ -28,12 +29,16 @@ CARD: Final = "README.md"
 ASSETS: Final = "assets"
 _WALK: Final = {"eta", "boundary", "step_ticks"}  # options of the random walk
 _PLOTS: Final = ("events", "returns", "actions", "depth")
+_GENERAL: Final = {option.name for option in fields(BaseEnvConfig)}  # every pair in them is a range
+_COSTS: Final = {"pose_cost", "action_rate_cost"}  # of every robot
 _BOUNDARY: Final = {"reflect": "reflected at the faces of the box", "clip": "clipped to the box"}
 
 
 @dataclass(frozen=True)
 class CardConfig:
-    """Write a dataset's card: contents, collection, schema, statistics, plots."""
+    """Write a dataset's card: contents, collection, schema, and for the G1 statistics and plots.
+
+    The plots go to `assets/` beside a README.md, and to `assets/NAME/` beside another NAME.md."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
@@ -41,8 +46,6 @@ class CardConfig:
     """Id on the Hub in the card's examples, `user/name`; empty: the dataset's own."""
     output: str = output_file()
     """File to write; empty: README.md in the dataset's folder."""
-    assets: str = ASSETS
-    """Folder for the plots, relative to the card."""
 
 
 def run_card(config: CardConfig) -> None:
@@ -51,49 +54,64 @@ def run_card(config: CardConfig) -> None:
     if config.repo_id and not is_repo_id(config.repo_id):
         raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name")
     reader = DatasetReader.open(config.dataset)
-    if reader.source.commit and not config.output:
+    if reader.root.resolve().is_relative_to(hub_cache().resolve()) and not config.output:
         raise UsageError(
             f"{reader.root} is the Hub's cache, which is not changed; give a file: --output=FILE"
         )
     output = user_path(config.output) if config.output else reader.root / CARD
-    statistics = compute_statistics(reader, ReturnConfig())
-    paths = draw_figures(statistics, ReturnConfig(), output.parent / config.assets)
-    plots = {path.stem: f"{config.assets}/{path.name}" for path in paths}
+    assets = ASSETS if output.name == CARD else f"{ASSETS}/{output.stem}"
+    statistics, paths = _statistics(reader), list[Path]()
+    if statistics is not None:
+        paths = draw_figures(statistics, ReturnConfig(), output.parent / assets)
+    plots = {path.stem: f"{assets}/{path.name}" for path in paths}
     output.parent.mkdir(parents=True, exist_ok=True)
     write_text(output, _render(reader, config.repo_id, statistics, plots))
-    echo(f"wrote {output} and {len(paths)} plots in {output.parent / config.assets}")
+    echo(f"wrote {output} and {len(paths)} plots in {output.parent / assets}")
 
 
 def card_text(reader: DatasetReader, repo_id: str) -> str:
     """The card of a dataset, with the plots in its ``assets``; ``repo_id`` is for the examples."""
     paths = {name: f"{ASSETS}/{name}.png" for name in _PLOTS}
     plots = {name: path for name, path in paths.items() if (reader.root / path).is_file()}
-    return _render(reader, repo_id, compute_statistics(reader, ReturnConfig()), plots)
+    return _render(reader, repo_id, _statistics(reader), plots)
+
+
+def _statistics(reader: DatasetReader) -> DatasetStatistics | None:
+    """None for another robot than the G1."""
+    return compute_statistics(reader, ReturnConfig()) if reader.robot.is_g1 else None
 
 
 def _render(
-    reader: DatasetReader, repo_id: str, statistics: DatasetStatistics, plots: Mapping[str, str]
+    reader: DatasetReader,
+    repo_id: str,
+    statistics: DatasetStatistics | None,
+    plots: Mapping[str, str],
 ) -> str:
     name = repo_id or reader.source.repo_id or f"user/{reader.root.name}"
-    tasks = [task.task for task in statistics.tasks]
-    provenance = reader.provenance
+    tasks = list(dict.fromkeys(reader.task(i) for i in range(len(reader))))
+    provenance, robot = reader.provenance, reader.robot
     parts = source_provenances(reader.origin)
     config, versions = common_settings([part.config for part in parts]), reader.origin.versions
     shortest, longest = config.get("step_ticks", (1, 1))
-    ranges, constants = settings_tables(config, tasks)
+    env = config.get("env", {})
+    if not robot.is_g1:  # sensors and randomisation of the G1 do not apply
+        env = {k: v for k, v in env.items() if k.removesuffix("_episode") in {*tasks, *_COSTS}}
+    ranges, constants = settings_tables(env, tasks)
     numbers = [reader.metadata(index).get("episode") for index in range(len(reader))]
-    checks = assess(statistics)
+    checks = assess(statistics) if statistics else []
+    robot_tags = [robot.robot_type, *(["humanoid"] if robot.is_g1 else [])]
     card = DatasetCard.from_template(
         DatasetCardData(
             license="apache-2.0",
             task_categories=["robotics"],
-            tags=["LeRobot", "egovcp", "unitree_g1", "humanoid", "depth", "world-model"],
+            tags=["LeRobot", "egovcp", *robot_tags, "depth", "world-model"],
             size_categories=[_size_category(reader.num_frames)],
             pretty_name=name.partition("/")[2],
             configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
         ),
         template_str=(files(__package__) / "card_template.md").read_text(encoding="utf-8"),
-        title=f"{name.partition('/')[2]}: Unitree G1, {', '.join(tasks)}",
+        dataset=name.partition("/")[2],
+        robot=robot,
         tasks=[{"name": task, "about": describe_task(task)} for task in tasks],
         episodes=len(reader),
         frames=reader.num_frames,
@@ -111,14 +129,12 @@ def _render(
         step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
         ranges=ranges,
         constants=constants,
-        coverage=coverage_table(statistics.tasks),
-        events=event_table(statistics.tasks),
+        coverage=coverage_table(statistics.tasks) if statistics else "",
+        events=event_table(statistics.tasks) if statistics else "",
         plots=plots,
         assessment=summary(checks),
         failed=[check for check in checks if not check.passed],
         repo_id=name,
-        rows=spec.DEPTH_ROWS,
-        cols=spec.DEPTH_COLS,
     )
     return f"{str(card).rstrip()}\n"
 
@@ -151,11 +167,12 @@ def common_settings(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return common
 
 
-def settings_tables(config: Mapping[str, Any], tasks: Sequence[str]) -> tuple[str, str]:
-    """Parameters drawn per episode, and constant ones, of a recorded configuration."""
+def settings_tables(env: Mapping[str, Any], tasks: Sequence[str]) -> tuple[str, str]:
+    """Parameters drawn per episode, and constant ones, of the recorded options ``--env.*``."""
     drawn, constant = [], []
-    for name, value, meaning in _settings(config.get("env", {}), tasks):
-        if isinstance(value, list) and len(value) == 2:  # a range
+    for name, value, meaning in _settings(env, tasks):
+        is_range = name.partition(".")[0] in _GENERAL or name.endswith(("_range", ".event_ticks"))
+        if is_range and isinstance(value, list) and len(value) == 2:
             low, high = value
             if low != high:
                 drawn.append((f"`env.{name}`", _format(low), _format(high), meaning))
@@ -172,9 +189,8 @@ def _settings(env: Mapping[str, Any], tasks: Sequence[str]) -> Iterator[tuple[st
     Options unknown to this version get an empty description.
     """
     defaults, docs = EnvConfig(), dict(field_docs(EnvConfig))
-    general = {option.name for option in fields(BaseEnvConfig)}
     for group, value in env.items():
-        own = group in general or group.removesuffix("_episode") in tasks
+        own = group in _GENERAL or group.removesuffix("_episode") in tasks
         if group == "threads" or (isinstance(value, Mapping) and not own):
             continue
         if not isinstance(value, Mapping):

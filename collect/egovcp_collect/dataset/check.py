@@ -20,8 +20,8 @@ from egovcp_collect.progress import progress_bar
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Read every file and every frame of a LeRobot v3 dataset, and print file, episode and frame of
-    each problem. Exits with code 3 if there is one.
+    """Read every file and every frame of a LeRobot v3 dataset, and list problems with file, episode
+    and frame (the first 20; --max_problems). Exits with code 3 if there is one.
 
     Datasets that egovcp collected are also checked against their hashes and recorded digests, for
     repeated episodes, and for actions that agree with the commands. Of others, whatever their
@@ -30,14 +30,14 @@ class CheckConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, which is checked without network access, or an id of the Hub."""
     max_problems: int = bounded(20, least=1)
-    """Stop after this many problems."""
+    """List at most this many problems, then stop."""
     json: str = output_file()
     """File for the result: {"ok", "episodes", "frames", "problems": [{"file", "episode", "frame",
     "problem"}], "not_checked": [...], null if it stopped after max_problems}; empty: none."""
 
 
 def run_check(config: CheckConfig) -> None:
-    """Print every problem, and a summary.
+    """Print the problems, and a summary.
 
     Raises:
         DataError: there is a problem, or no dataset.
@@ -49,8 +49,9 @@ def run_check(config: CheckConfig) -> None:
         root = locate(config.dataset).root
     with progress_bar() as progress:
         notes: list[str] = []
-        problems = list(islice(dataset_problems(root, progress, notes), config.max_problems))
-    stopped = len(problems) == config.max_problems
+        found = list(islice(dataset_problems(root, progress, notes), config.max_problems + 1))
+    problems = found[: config.max_problems]
+    stopped = len(found) > len(problems)
     episodes, frames = _size(root)
     result = {
         "ok": not problems,
@@ -73,9 +74,9 @@ def run_check(config: CheckConfig) -> None:
             f"would read; remove them: find {folders} -name '.*' -prune -exec rm -r {{}} +"
         )
     if problems:
-        more = " or more" if stopped else ""
+        more = "more than " if stopped else ""
         raise DataError(
-            f"{len(problems)}{more} problem(s) in {root}, the first: {problems[0]}; "
+            f"{more}{len(problems)} problem(s) in {root}, the first: {problems[0]}; "
             f"`egovcp-dataset repair {shlex.quote(str(root))} --output_dir=NEW` keeps the valid "
             "episodes"
         )

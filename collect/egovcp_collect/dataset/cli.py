@@ -13,7 +13,7 @@ COMMANDS: Final = CommandGroup(
         name: Subcommand(f"{_PACKAGE}.{function}", summary, _DATASET, more)
         for name, function, summary, more in (
             ("info", "info:run_info", "print tasks, episodes, hours and provenance", ""),
-            ("check", "check:run_check", "read every file and frame; list all problems", ""),
+            ("check", "check:run_check", "read all files and frames; list the first problems", ""),
             ("repair", "rewrite:run_repair", "write the readable episodes to a new dataset", ""),
             ("delete", "edit:run_delete", "write it without some episodes to a new folder", ""),
             ("split", "edit:run_split", "split it at random into several datasets", ""),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -16,16 +16,7 @@ from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source, read_source, write_source
 from egovcp.data.writer import publish_version
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import (
-    Content,
-    Publication,
-    PublishConfig,
-    RetryPolicy,
-    fetch,
-    is_repo_id,
-    publish,
-    resolve,
-)
+from egovcp.hub import Content, PublishConfig, RetryPolicy, fetch, is_repo_id, resolve
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
@@ -39,7 +30,8 @@ _OWNED: Final = ("data", "meta", "videos", "images", ASSETS)
 class DatasetPushConfig(PublishConfig):
     """Publish a dataset and its card on the Hub in one commit, and tag it for LeRobot.
 
-    The dataset is checked first. A failed push can be repeated: it uploads what is missing, and
+    A README.md in its folder is published as it is; without one, a card is written for the Hub. The
+    dataset is checked first. A failed push can be repeated: it uploads what is missing, and
     makes no commit if nothing differs.
     """
 
@@ -87,28 +79,21 @@ def run_push(config: DatasetPushConfig) -> None:
         check_dataset(DatasetConfig(root=str(reader.root)), progress)
     tasks = sorted({reader.task(i) for i in range(len(reader))})
     size = f"{len(reader)} episodes, {reader.num_frames} frames"
-    published = publish(
-        Publication(
-            repo_id=config.repo_id,
-            contents={**contents, CARD: Content(card_text(reader, config.repo_id).encode())},
-            message=config.message or f"{size}: {', '.join(tasks)}",
-            owned=_OWNED,
-            branch=config.branch,
-            private=config.private,
-            moving_tag=schema.CODEBASE_VERSION if config.branch == "main" else "",
-            tag=config.tag,
-        ),
-        config.network,
+    if CARD in contents:
+        echo(f"{CARD} is published as it is; `egovcp-dataset card` writes it anew")
+    else:
+        contents[CARD] = Content(card_text(reader, config.repo_id).encode())
+    commit = config.publish(
+        contents,
+        f"{size}: {', '.join(tasks)}",
+        owned=_OWNED,
+        moving_tag=schema.CODEBASE_VERSION if config.branch == "main" else "",
     )
-    name, commit = config.repo_id, published.commit
-    echo(f"{name}@{config.branch} {'is now' if published.new else 'was already'} {commit}")
-    echo(f"egovcp-train --dataset.repo_id={name} --dataset.revision={commit}")
-    result = {"repo_id": name, "branch": config.branch, "tag": config.tag, **asdict(published)}
-    write_report(config.json, result)
+    echo(f"egovcp-train --dataset.repo_id={config.repo_id} --dataset.revision={commit}")
 
 
 def _contents(root: Path) -> dict[str, Content]:
-    """Every file except hidden ones, the card, and the note of the source."""
+    """Every file except hidden ones and the note of the source."""
     contents: dict[str, Content] = {}
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root)
@@ -116,7 +101,7 @@ def _contents(root: Path) -> dict[str, Content]:
             continue
         if path.is_symlink():
             raise DataError(f"{path} is a link; a dataset to publish holds plain files")
-        if path.is_file() and name.as_posix() not in (CARD, schema.SOURCE_PATH):
+        if path.is_file() and name.as_posix() != schema.SOURCE_PATH:
             contents[name.as_posix()] = Content(path)
     return contents
 

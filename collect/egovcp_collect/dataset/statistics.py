@@ -172,8 +172,8 @@ def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetS
     """
     if not reader.robot.is_g1:
         raise UsageError(
-            f"{reader.root} is of robot {reader.robot.robot_type}: statistics and cards are "
-            "available for the G1 only; use `egovcp-dataset info` and `check`"
+            f"{reader.root} is of robot {reader.robot.robot_type}: statistics are available for "
+            "the G1 only; use `egovcp-dataset info` and `check`"
         )
     rows = read_rows(reader, returns)
     samples = [sample_episodes(reader, task) for task in rows]

@@ -45,7 +45,7 @@ class ValidEpisode:
     """An episode whose rows have no problem."""
 
     row: EpisodeRow
-    """Its row in ``meta/episodes``; without columns if that does not list it."""
+    """Its row in ``meta/episodes``; ``columns`` is empty if it is not listed there."""
     table: pa.Table
     """Its rows, with all columns."""
     values: dict[str, NDArray[Any]]

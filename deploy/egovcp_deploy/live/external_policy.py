@@ -118,7 +118,7 @@ class ExternalPolicyRobot:
 
     def close(self) -> None:
         """Hold, ease the hands to neutral, damp, and disconnect; further calls do nothing. A robot
-        on its own feet sinks to the ground: hang it up first."""
+        on its own feet collapses to the floor: hang it up first."""
         if self._closing:
             return
         self._closing = True

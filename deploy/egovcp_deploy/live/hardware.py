@@ -44,7 +44,7 @@ class RobotOptions:
     camera: CameraOptions = field(default_factory=CameraOptions)
     """The depth camera of a unitree_g1."""
     limits: Limits = field(default_factory=Limits)
-    """When the robot is held, and when its motors are damped."""
+    """When the robot is held, when its motors are damped, and how long it takes to stand up."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
     INIT -> STAND -> ARMED -> RUN <-> HOLD          any -> DAMP, latched
 
-DAMP lets a standing robot sink to the ground, so it is reserved for what standing cannot survive:
-lost proprioception, a controller without finite targets, a fall, the operator's emergency stop.
+In DAMP a standing robot collapses to the floor, so it is reserved for what standing cannot
+survive: lost proprioception, a controller without finite targets, a fall, an emergency stop.
 A robot without planner or camera can still stand: that is HOLD.
 """
 
@@ -48,7 +48,7 @@ class OperatorCommand(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """Thresholds for HOLD and DAMP."""
+    """Thresholds for HOLD and DAMP, and the times of recovery and standing up."""
 
     state_hold_s: float = bounded(0.1, above=0)
     """HOLD when proprioception is older, s."""
@@ -67,7 +67,7 @@ class Limits:
     recover_s: float = bounded(1.0, least=0)
     """HOLD ends after this time without a fault, s."""
     stand_s: float = bounded(3.0, above=0)
-    """Time in which the gains ramp in, s."""
+    """Time in which STAND ramps up the gains, s."""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ class BridgeConfig:
     """Port for commands."""
     mode: int | None = None
     """Required mode machine, which identifies the robot's variant; null: any with 29 joints and a
-    free waist. Naming a mode with a locked waist accepts it."""
+    free waist. To run with a locked waist, name its mode."""
 
     def __post_init__(self) -> None:
         check_bounds(self)

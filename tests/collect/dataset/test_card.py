@@ -1,6 +1,7 @@
 """`egovcp-dataset card`: metadata, tables, plots."""
 
 import re
+import shutil
 from pathlib import Path
 
 import datasets
@@ -12,8 +13,7 @@ import egovcp_collect.dataset
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, Provenance, schema
 from egovcp.data.metadata import verify_hashes
-from egovcp.data.source import Source
-from egovcp.errors import UsageError
+from egovcp.data.source import Source, write_source
 from egovcp.help_text import field_docs
 from egovcp.sim.tasks import task_names
 from egovcp_collect.dataset import card
@@ -100,7 +100,7 @@ def test_a_walk_with_longer_steps_is_described(tmp_path: Path) -> None:
 def test_every_setting_of_a_task_is_documented() -> None:
     env = SETTINGS.config["env"]
     for task in task_names(training=True):
-        both = "\n".join(settings_tables(SETTINGS.config, [task]))
+        both = "\n".join(settings_tables(env, [task]))
         for name in (*env[task], *env["camera"], *env["randomise"], *env[f"{task}_episode"]):
             (line,) = {s for s in both.splitlines() if re.search(rf"`env\.\w+\.{name}`", s)} or {""}
             assert line, name
@@ -108,10 +108,23 @@ def test_every_setting_of_a_task_is_documented() -> None:
 
 
 def test_a_setting_of_another_version_has_no_documentation() -> None:
-    config = {"env": {"ball": {"spin_range": [0.0, 1.0]}, "moon": True}}
-    drawn, constant = settings_tables(config, ["ball"])
+    drawn, constant = settings_tables({"ball": {"spin_range": [0.0, 1.0]}, "moon": True}, ["ball"])
     assert "| `env.ball.spin_range` | 0 | 1 |  |" in drawn
     assert "| `env.moon` | True |  |" in constant
+
+
+def test_only_a_range_is_drawn() -> None:
+    env = {
+        "camera": {"edge_probability": [0.0, 0.25]},
+        "ball": {"mount": [0.1, 0.5], "sides": ["left", "right"], "mass_range": [1.0, 1.0]},
+        "ball_episode": {"event_ticks": [4, 20]},
+    }
+    drawn, constant = settings_tables(env, ["ball"])
+    assert "| `env.camera.edge_probability` | 0 | 0.25 |" in drawn
+    assert "| `env.ball_episode.event_ticks` | 4 | 20 |" in drawn
+    assert "| `env.ball.mount` | 0.1, 0.5 |" in constant
+    assert "| `env.ball.sides` | left, right |" in constant
+    assert "| `env.ball.mass_range` | 1 |" in constant
 
 
 def test_field_docs_read_fields_of_any_type() -> None:
@@ -146,20 +159,30 @@ def test_card_and_plots_do_not_change_the_data(carded: DatasetReader) -> None:
 def test_a_card_can_be_written_elsewhere(carded: DatasetReader, tmp_path: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")}
     output = tmp_path / "cards" / "three.md"
-    assert main(["card", str(carded.root), f"--output={output}", "--assets=assets/three"]) == 0
+    assert main(["card", str(carded.root), f"--output={output}"]) == 0
     found = IMAGE.findall(output.read_text())
     assert len(found) == 4
+    assert all(path.startswith("assets/three/") for path in found)
     assert all((output.parent / path).is_file() for path in found)
     assert {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")} == before
 
 
 def test_the_hub_cache_is_not_changed(
-    carded: DatasetReader, monkeypatch: pytest.MonkeyPatch
+    carded: DatasetReader,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    reader = DatasetReader(Source(carded.root, "me/three", commit="0" * 40))
-    monkeypatch.setattr(card.DatasetReader, "open", lambda config: reader)
-    with pytest.raises(UsageError, match="--output"):
-        card.run_card(CardConfig())
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(card, "draw_figures", lambda *_: [])
+    cached = shutil.copytree(carded.root, tmp_path / "home/hub/datasets--me--three/snapshots/abc")
+    assert main(["card", str(cached)]) == 2
+    assert "give a file: --output=FILE" in capsys.readouterr().err
+    pulled = shutil.copytree(carded.root, tmp_path / "pulled")
+    write_source(Source(pulled, "me/three", "0" * 40))
+    (pulled / "README.md").unlink()
+    assert main(["card", str(pulled)]) == 0
+    assert 'LeRobotDataset("me/three")' in (pulled / "README.md").read_text()
 
 
 def test_the_linked_template_equals_the_packaged_one() -> None:

@@ -44,7 +44,9 @@ def test_a_sound_dataset_passes(
     }
 
 
-def test_every_problem_is_listed_up_to_the_limit(copy: Path, tmp_path: Path) -> None:
+def test_every_problem_is_listed_up_to_the_limit(
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (copy / d.HASHES).unlink()
     d.column("next.reward", d.put(14, float("nan")))(copy)
     d.column("timestamp", d.put(15, 9.0))(copy)
@@ -61,6 +63,14 @@ def test_every_problem_is_listed_up_to_the_limit(copy: Path, tmp_path: Path) -> 
     ]
     assert main(["check", str(copy), f"--json={report}", "--max_problems=2"]) == 3
     assert json.loads(report.read_text())["problems"] == problems[:2]
+    shown = capsys.readouterr()
+    assert "stopped after 2 problems" in shown.out
+    assert "more than 2 problem(s)" in shown.err
+    assert main(["check", str(copy), f"--json={report}", "--max_problems=4"]) == 3
+    assert json.loads(report.read_text())["not_checked"] == []
+    shown = capsys.readouterr()
+    assert "stopped" not in shown.out
+    assert "error: 4 problem(s)" in shown.err
 
 
 def test_a_wrong_statistic_is_reported_with_the_name_of_its_value(

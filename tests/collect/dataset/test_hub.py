@@ -14,6 +14,8 @@ from egovcp_collect.dataset.cli import main
 from tests.support.hub import FakeHub
 from tests.support.hub.faults import HubFaultKind
 
+from .episodes import ARM
+
 REPO = "datasets/me/six"
 QUICK = ("--network.attempts=2", "--network.wait_s=0.01", "--network.timeout_s=20")
 TOKEN = "hf_NobodyMayEverSeeThis"
@@ -74,6 +76,32 @@ def test_a_pulled_dataset_equals_the_pushed_one(
     assert (source.repo_id, source.commit) == ("me/six", commit)
     assert sorted(p.name for p in tmp_path.glob(".*")) == []
     assert "me/six" in (copy / "README.md").read_text()
+
+
+def published_card(hub: FakeHub) -> str:
+    file = hub.store.commit(REPO, "main").files["README.md"]
+    return hub.store.blob(file.sha256).read_text(encoding="utf-8")
+
+
+def test_a_card_in_the_folder_is_published_as_it_is(
+    hub: FakeHub, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (root / "README.md").write_text("edited by hand\n")
+    assert push(root) == 0
+    assert published_card(hub) == "edited by hand\n"
+    assert "README.md is published as it is" in capsys.readouterr().out
+
+
+def test_a_dataset_of_another_robot_is_published_with_a_card(hub: FakeHub, tmp_path: Path) -> None:
+    with DatasetWriter(tmp_path / "arm", Provenance("arm-1", seed=0)) as writer:
+        writer.add(random_episode(0, task="reach", robot=ARM))
+    assert push(tmp_path / "arm") == 0
+    text = published_card(hub)
+    assert "| `observation.images.ego_depth` | image, uint16 | (32, 48, 1) |" in text
+    assert "| `b` | -2.0 | 0.0 | 2.0 |" in text
+    assert "angle.a" in text
+    for word in ("G1", "hand", "pelvis", "## Statistics", "env.delay"):
+        assert word not in text, word
 
 
 def test_pushing_again_completes_the_tag_only(hub: FakeHub, root: Path) -> None:

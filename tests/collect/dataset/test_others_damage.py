@@ -162,7 +162,7 @@ def test_what_is_not_checked_is_unknown_after_the_last_problem(
     others: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(others["arm"], tmp_path / "copy"))
-    d.info(total_frames=99)(root)
+    d.info(total_frames=99, total_tasks=9)(root)
     report = tmp_path / "report.json"
     assert main(["check", str(root), f"--json={report}", "--max_problems=1"]) == 3
     assert json.loads(report.read_text())["not_checked"] is None
