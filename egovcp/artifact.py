@@ -16,6 +16,7 @@ import hashlib
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -176,20 +177,22 @@ def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
 @contextmanager
 def replaced_folder(path: Path) -> Iterator[Path]:
     """A new folder that replaces ``path`` at the end of the block; on an error ``path`` stays."""
-    old = path.with_name(path.name + ".old")
-    with removed_on_error(path.with_name(path.name + ".partial")) as new:
-        shutil.rmtree(new, ignore_errors=True)
-        new.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    private = Path(tempfile.mkdtemp(prefix=".egovcp-", dir=path.parent))
+    old = private.with_name(private.name + ".old")  # not within: that is removed on an error
+    with removed_on_error(private):
+        new = private / "new"
+        new.mkdir()  # `mkdtemp` would make it readable by its owner only
         yield new
-        shutil.rmtree(old, ignore_errors=True)
-        if path.exists():
-            path.rename(old)
         try:
+            if path.exists():
+                path.rename(old)
             new.rename(path)
-        except OSError:
-            if old.exists():
+        except BaseException:
+            if old.exists() and not path.exists():
                 old.rename(path)
             raise
+    private.rmdir()
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -17,6 +17,7 @@ later.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -31,14 +32,18 @@ INTERRUPTED = 130  # 128 + SIGINT, as a shell reports a program which that signa
 _RETRY_S = 0.05
 _IMPORT_MACHINERY = "<frozen importlib._bootstrap>"
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that signal ended
+#: Errors of writing to a stream.
+_WRITE_ERRNOS = (errno.EAGAIN, errno.EBADF, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENOSPC)
+#: Integers, without which `huggingface_hub` cannot be imported.
+_HUB_VARIABLES = ("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT")
 
 
 class EntryPoint:
     """A command whose module is imported when it is called."""
 
     def __init__(self, prog: str, module: str, task_argument: int | None = None) -> None:
-        """The command ``prog``, which is ``module.main(argv) -> int``; the argument with number
-        ``task_argument`` may name a task, as ``--task`` does."""
+        """The command ``prog``, which is ``module.main(argv) -> int``; the argument without a flag
+        with number ``task_argument`` may name a task, as ``--task`` does."""
         self.prog, self.module, self._task_argument = prog, module, task_argument
 
     def __call__(self, argv: Sequence[str] | None = None) -> int:
@@ -58,7 +63,7 @@ class EntryPoint:
                 return BROKEN_PIPE
             return _report_bug()
         except OSError as error:
-            if error.filename is not None:
+            if error.filename is not None or error.errno not in _WRITE_ERRNOS:
                 return _report_bug()
             _print_last(f"{self.prog}: error: cannot write the output: {error}\n")
             return EnvironmentFailure.exit_code
@@ -76,12 +81,13 @@ class EntryPoint:
         if "--version" in (sys.argv[1:] if argv is None else argv):
             return self._print_version()
         try:
+            _check_hub_variables()
             argv = self._with_task(sys.argv[1:] if argv is None else argv)
             main: Callable[[Sequence[str] | None], int] = import_module(self.module).main
             code = main(argv)
         except ModuleNotFoundError as error:
             return self._missing(error)
-        except EgovcpError as error:  # of --task=module:Class
+        except EgovcpError as error:  # of the environment, or of --task=module:Class
             echo(f"{self.prog}: error: {one_line(error)}", error=True)
             return error.exit_code
         except SystemExit as end:  # argparse, after --help
@@ -95,11 +101,15 @@ class EntryPoint:
 
         Tasks are registered before the command is imported, so that it has their options.
         """
-        args = list(argv)
-        for i, arg in enumerate(args):
+        args, places = list(argv), 0
+        for i, (previous, arg) in enumerate(zip(["", *args], argv, strict=False)):
             value = arg.removeprefix("--task=")
-            is_task = value != arg or (i and args[i - 1] == "--task")
-            if ":" in value and (is_task or i == self._task_argument):
+            is_task = value != arg or previous == "--task"
+            is_flag_value = previous.startswith("-") and "=" not in previous
+            if not arg.startswith("-") and not is_flag_value:
+                is_task = places == self._task_argument
+                places += 1
+            if ":" in value and is_task:
                 from egovcp.sim.tasks.registry import register_task
 
                 items = value.split(",")
@@ -125,6 +135,18 @@ class EntryPoint:
             raise error
         echo(f"{self.prog}: error: {missing}", error=True)
         return missing.exit_code
+
+
+def _check_hub_variables() -> None:
+    from egovcp.errors import EnvironmentFailure
+
+    for name in _HUB_VARIABLES:
+        try:
+            int(os.environ.get(name, "0"))
+        except ValueError:
+            raise EnvironmentFailure(
+                f"{name}={os.environ[name]}: expected whole seconds; change or unset this variable"
+            ) from None
 
 
 def prepare_process() -> None:

@@ -144,7 +144,10 @@ def _value(flag: str, text: str, kind: Any) -> Any:
     """The checked value of a flag; a group stays a mapping, to be merged with other flags."""
     value: Any = text
     if is_collection(kind) and text:
-        value = collection_or_text(text)
+        try:
+            value = collection_or_text(text)
+        except WrongValue as error:
+            raise WrongValue.of(flag, text, kind, f"; {error}") from error
     if is_dataclass_type(kind) and isinstance(value, Mapping):
         return value
     convert(kind, value, flag)
@@ -198,7 +201,7 @@ def read_config(path: Path) -> dict[str, Any]:
     text = read_text(path, _FILE_LIMIT_BYTES)
     try:
         found: Any = tomllib.loads(text) if path.suffix == ".toml" else parse_collection(text)
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, WrongValue) as error:
         raise ValueError(f"holds no options: {error}") from error
     if not isinstance(found or {}, dict):
         raise ValueError(f"holds a {type(found).__name__}; expected options, name: value")

@@ -26,7 +26,7 @@ SEAL: Final = "manifest_sha256"
 FORMAT_KEYS: Final = ("schema_version", "egovcp_version", "features", "files", SEAL)
 """Entries that are made when an artifact is written; all others are its provenance."""
 
-#: Type of each entry that is read; all but the first two are optional.
+#: Type of each entry that is read; all but the first three are optional.
 _TYPES: Final[Mapping[str, Any]] = {
     "controller_id": str,
     "files": dict[str, str],
@@ -41,11 +41,15 @@ _TYPES: Final[Mapping[str, Any]] = {
     "heldout_tasks": dict[str, dict[str, Any]],
     "train_config": dict[str, Any],
 }
-_REQUIRED: Final = ("controller_id", "files")
+_REQUIRED: Final = ("controller_id", "files", "egovcp_version")
 _DATASET_TYPES: Final[Mapping[str, Any]] = {
     "repo_id": str | None,
     "revision": str | None,
     "episodes": str | None,
+}
+_DATASET_OPTIONS: Final[Mapping[str, Any]] = {
+    "dataset": dict[str, Any] | None,
+    "datasets": list[dict[str, Any]] | None,
 }
 
 
@@ -125,6 +129,13 @@ def _check_types(manifest: Mapping[str, Any]) -> None:
     for index, dataset in enumerate(manifest.get("datasets", [])):
         for name, kind in _DATASET_TYPES.items():
             require_type(dataset.get(name), kind, f"datasets[{index}].{name}")
+        if dataset.get("revision") and not dataset.get("repo_id"):
+            raise DecodeError(f"datasets[{index}].repo_id is missing")
+    options = manifest.get("train_config", {})
+    for name, kind in _DATASET_OPTIONS.items():
+        require_type(options.get(name), kind, f"train_config.{name}")
+    for dataset in [options.get("dataset") or {}, *(options.get("datasets") or [])]:
+        require_type(dataset.get("root"), str | None, "root of a dataset in train_config")
 
 
 def finite_or_null(value: Any) -> Any:

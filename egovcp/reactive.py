@@ -25,7 +25,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import OutOfBounds, bounded, check_bounds
 from egovcp.decode import decode, shown
 from egovcp.errors import ArtifactError
 from egovcp.files import write_bytes
@@ -54,6 +54,8 @@ class ReactiveConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        if not self.hidden:
+            raise OutOfBounds("hidden", self.hidden, "at least one layer")
 
 
 @dataclass(frozen=True)

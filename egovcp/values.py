@@ -15,7 +15,7 @@ from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
-from draccus import cfgparsing
+from draccus.parsers.yaml_loader import SafeLoaderWithInclusion
 
 from egovcp.bounds import OutOfBounds, as_flag_value
 from egovcp.errors import UsageError, did_you_mean
@@ -33,6 +33,25 @@ _INT_LIMIT: Final = 2**63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
 """The option that is probably meant by the name of a group such as ``--dataset``."""
 _SHOWN_OPTIONS: Final = 6
+
+
+class _YamlLoader(SafeLoaderWithInclusion):
+    """Refuses keys that are not text, and keys that are given twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
+        keys: set[str] = set()
+        for key, _ in node.value:
+            line = key.start_mark.line + 1
+            if not isinstance(key.value, str):
+                raise WrongValue(f"a key in line {line} is a collection; expected text")
+            text = as_flag_value(key.value)
+            if not key.tag.endswith((":str", ":merge", ":value")):
+                raise WrongValue(f'key {text} in line {line} is not text; write "{text}"')
+            if key.value in keys:
+                raise WrongValue(f"key {text} is given a second time in line {line}")
+            keys.add(key.value)
+        found: dict[str, Any] = super().construct_mapping(node, deep)
+        return found
 
 
 class WrongValue(UsageError):
@@ -96,14 +115,19 @@ def parse_collection(text: str) -> Any:
     """The value of a YAML text; a list may be in parentheses.
 
     Raises:
-        ValueError: invalid YAML, or nested too deeply.
+        ValueError: invalid YAML, nested too deeply, or an alias of a collection within itself.
+        WrongValue: a key is not text, or is given twice.
     """
     check_depth(text)
     stripped = text.strip()
     if stripped.startswith("(") and stripped.endswith(")"):
         text = f"[{stripped[1:-1]}]"
     try:
-        return cfgparsing.parse_string(text)
+        loader = _YamlLoader(text)  # type: ignore[no-untyped-call]
+        node = loader.get_single_node()
+        return None if node is None else loader.construct_object(node, deep=True)
+    except WrongValue:
+        raise
     except Exception as error:
         raise ValueError(" ".join(str(error).split())) from error
 

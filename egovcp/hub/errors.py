@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import os
+import ssl
 from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -19,6 +21,9 @@ type RepoType = Literal["dataset", "model"]
 """Type of a Hub repository; each has its own namespace of ids."""
 
 _MISSING: Final[dict[RepoType, type[EgovcpError]]] = {"dataset": DataError, "model": ArtifactError}
+
+
+_CERTIFICATES: Final = ("SSL_CERT_FILE", "SSL_CERT_DIR")  # the first that is set is used
 
 
 class LostUpdate(EnvironmentFailure):
@@ -138,6 +143,12 @@ def _translate(
             case HFValidationError():
                 return UsageError(f"{repo_id!r} is not the id of a {repo_type}: {_line(link)}")
     network = isinstance(error, (ConnectionError, TimeoutError, LocalEntryNotFoundError))
+    if isinstance(error, (FileNotFoundError, ssl.SSLError)) and error.filename is None:
+        given = [f"{n}={os.environ[n]}" for n in _CERTIFICATES if os.environ.get(n)]
+        return EnvironmentFailure(
+            f"the certificates of {given[0] if given else 'certifi'} cannot be loaded: "
+            f"{error.strerror or error}; change or unset the variable, or install certifi again"
+        )
     if isinstance(error, OSError) and error.errno is not None and not network:
         return error  # the disk
     if isinstance(chain[-1], (ConnectionError, TimeoutError, RuntimeError)):  # of hf_xet

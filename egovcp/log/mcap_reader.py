@@ -9,6 +9,7 @@ reader.losses  # ticks that could not be read
 
 from __future__ import annotations
 
+import shlex
 import struct
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -132,7 +133,7 @@ class RecordingReader:
         """The record ``egovcp``, without its checksum."""
         try:
             self.info = RunInfo.from_metadata(self.metadata)
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (KeyError, ValueError) as error:
             problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
             raise DataError(f"{self._path}: {problem}") from error
 
@@ -177,7 +178,7 @@ class RecordingReader:
         if self.damaged:
             raise DataError(
                 f"{self._path} is damaged: {self.loss_text()}; keep the readable ticks: "
-                f"egovcp-mcap recover {self._path} RECOVERED.mcap"
+                f"egovcp-mcap recover {shlex.quote(str(self._path))} RECOVERED.mcap"
             )
 
     def loss_text(self) -> str:

@@ -6,12 +6,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
-from typing import Final, Literal, Protocol
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.decode import decode
+from egovcp.files import check_depth
 from egovcp.robot.geometry import focal_length
 from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, SPEC_VERSION, Solid
@@ -186,20 +188,33 @@ class RunInfo:
 
     @staticmethod
     def from_metadata(record: Mapping[str, str]) -> RunInfo:
-        """The inverse of `to_metadata`."""
-        camera = json.loads(record["camera"])
-        return RunInfo(
+        """The inverse of `to_metadata`.
+
+        Raises:
+            KeyError: an entry is missing.
+            ValueError: an entry has another type or is out of bounds.
+        """
+
+        def value[T](key: str, kind: type[T]) -> T:
+            check_depth(record[key])
+            return decode(kind, json.loads(record[key]), key)
+
+        info = RunInfo(
             task=record["task"],
-            seed=int(record["seed"]),
-            episode=int(record["episode"]),
-            fps=int(record["fps"]),
-            camera=CameraView(**camera | {"position": tuple(camera["position"])}),
-            config=json.loads(record["config"]),
-            hashes=json.loads(record["hashes"]),
-            versions=json.loads(record["versions"]),
+            seed=value("seed", int),
+            episode=value("episode", int),
+            fps=value("fps", int),
+            camera=value("camera", CameraView),
+            config=value("config", dict[str, Any]),
+            hashes=value("hashes", dict[str, str]),
+            versions=value("versions", dict[str, str]),
             backend=record.get("backend", ""),  # absent in older recordings
-            robot=RobotSpec.from_json(json.loads(record[ROBOT_KEY])) if ROBOT_KEY in record else G1,
         )
+        if info.fps <= 0 or not 0 < info.camera.vertical_fov < math.pi:
+            raise ValueError("expected fps > 0, and camera.vertical_fov between 0 and pi")
+        if ROBOT_KEY not in record:
+            return info
+        return replace(info, robot=RobotSpec.from_json(value(ROBOT_KEY, dict[str, Any])))
 
 
 class Sink(Protocol):

@@ -60,7 +60,7 @@ CASES = {
         ("output_dir", "json"),
     ),
     "egovcp-dataset coverage": ("DATA", ("dataset.root",), ("output_dir", "json")),
-    "egovcp-dataset card": ("DATA --output=NEW", ("dataset.root",), ("output", "assets")),
+    "egovcp-dataset card": ("DATA --output=NEW", ("dataset.root",), ("output",)),
     "egovcp-dataset viz": ("DATA --output=NEW", ("dataset.root",), ("output",)),
     "egovcp-dataset push": ("DATA --repo_id=me/data", ("dataset.root",), ()),
     "egovcp-dataset pull": ("me/data --output_dir=NEW", (), ("output_dir",)),

@@ -73,7 +73,7 @@ class Config:
     quiet: bool = True
     """Quiet."""
     mode: Literal["fast", "slow"] = "fast"
-    """Mode."""
+    """Mode. It is written in the log."""
     sizes: tuple[int, int, int] = (1, 2, 3)
     """Sizes."""
     preset: str = "small"
@@ -204,6 +204,27 @@ def test_aliases_that_stand_for_millions_of_values_are_not_expanded(
     (tmp_path / "bomb.yaml").write_text(f"{option}: [&a0 [x, x], {', '.join(lists)}]")
     with pytest.raises(UsageError, match=f"^--{option}=.*: expected"):
         _parse(f"--config_path={tmp_path}/bomb.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{radius: 1, radius: 2}", "key radius is given a second time in line 1"),
+        ("{1: 2}", 'key 1 in line 1 is not text; write "1"'),
+        (f"{{? 0x{'f' * 4000} : 1}}", "key 0xf+... in line 1 is not text"),
+        ("{[1]: 2}", "a key in line 1 is a collection"),
+        ("&a {radius: *a}", "--ball=&a {radius: ..}: expected {NAME: VALUE, ...}"),
+    ],
+)
+def test_groups_have_distinct_text_keys_and_no_alias_to_themselves(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        _parse(f"--ball={text}")
+
+
+def test_a_key_that_a_file_gives_twice_is_refused_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("name: x\nball:\n  radius: 1\n  radius: 2\n")
+    with pytest.raises(UsageError, match=r"a\.yaml .*key radius is given a second time in line 4"):
+        _parse(f"--config_path={tmp_path}/a.yaml")
 
 
 @pytest.mark.parametrize(("text", "kind"), [("- 1", "list"), ("x", "str")])
@@ -394,6 +415,18 @@ def test_help_ends_well_and_shows_defaults_and_units(capsys: pytest.CaptureFixtu
     text = " ".join(capsys.readouterr().out.split())
     for part in ("--ball.radius", "Radius, m", "0.1", "A command for tests", "--debug"):
         assert part in text
+
+
+def test_help_shows_where_a_description_is_shortened(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        _run("--help")
+    short = " ".join(capsys.readouterr().out.split())
+    assert "Mode ... (default: fast)" in short
+    assert "How many. (default: 1)" in short
+    assert "'...': shortened, see --help=all" in short
+    with pytest.raises(SystemExit):
+        _run("--help=all")
+    assert "Mode. It is written in the log." in capsys.readouterr().out
 
 
 def test_help_lists_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from egovcp.entry_point import EntryPoint
+
 type Run = Callable[..., subprocess.CompletedProcess[bytes]]
 
 INTERRUPT = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -152,6 +154,25 @@ def test_log_messages_are_escaped(run: Run) -> None:
     assert b"\\x1b[31m" in run(text).stderr
 
 
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["check", "--env.camera={a: [0, 1]}", "ball"], None),
+        (["check", "--env.camera", "{a: [0, 1]}", "my:Task"], "my:Task"),
+        (["check", "my:Task"], "my:Task"),
+        (["check", "--task", "my:Task"], "my:Task"),
+    ],
+)
+def test_only_the_argument_of_a_task_names_one(
+    argv: list[str], expected: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[str] = []
+    register = lambda text: found.append(text) or "name"  # type: ignore[func-returns-value]  # noqa: E731
+    monkeypatch.setattr("egovcp.sim.tasks.registry.register_task", register)
+    EntryPoint("egovcp-test", "none", task_argument=1)._with_task(argv)
+    assert found == ([expected] if expected else [])
+
+
 # --- failures ---------------------------------------------------------------------------
 def test_a_missing_package_is_named_with_the_command_that_installs_it(run: Run) -> None:
     done = run(f"import no_such_package.part\n{MAIN}    return 0\n")
@@ -159,6 +180,18 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(run: Run) 
     expected = b"egovcp-test: error: egovcp-test needs no-such-package, which is not installed"
     assert done.stderr.startswith(expected)
     assert done.stderr.count(b"\n") == 1
+
+
+def test_a_hub_variable_that_is_no_number_is_named(run: Run) -> None:
+    done = run(f"{MAIN}    return 0\n", env={"HF_HUB_DOWNLOAD_TIMEOUT": "abc"})
+    assert done.returncode == 5
+    assert done.stderr.startswith(b"egovcp-test: error: HF_HUB_DOWNLOAD_TIMEOUT=abc: expected")
+
+
+def test_an_error_without_a_file_is_not_blamed_on_the_output(run: Run) -> None:
+    done = run(f"{MAIN}    raise FileNotFoundError(2, 'No such file or directory')\n")
+    assert done.returncode == 1
+    assert b"cannot write the output" not in done.stderr
 
 
 def test_a_bug_has_exit_code_1_and_an_escaped_traceback(run: Run) -> None:

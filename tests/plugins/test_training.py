@@ -1,6 +1,7 @@
 """LeRobot's windows become the batches that egovcp-train learns from."""
 
 import dataclasses
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -254,7 +255,11 @@ def test_a_policy_without_dataset_can_neither_train_nor_be_saved(
 
 @pytest.mark.parametrize(
     "options",
-    [{"sequence_length": 1}, {"drop_n_last_frames": -1}, {"returns": ReturnConfig(steps=0)}],
+    [
+        *({"sequence_length": 1}, {"drop_n_last_frames": -1}, {"returns": ReturnConfig(steps=0)}),
+        *({"optimizer_lr": math.nan}, {"scheduler_decay_steps": -1}, {"planner_seed": 2**70}),
+        {"sequence_length": 10**9},
+    ],
 )
 def test_senseless_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="--policy"):

@@ -121,6 +121,23 @@ def test_a_second_rounding_changes_nothing(half: Path, tmp_path: Path) -> None:
         assert (output / name).read_bytes() == (half / name).read_bytes()
 
 
+def test_a_link_to_an_empty_folder_is_followed(single: Path, tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    assert main([f"--policy.path={single}", f"--output_dir={tmp_path / 'link'}"]) == 0
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / publish.CARD).is_file()
+
+
+def test_a_failure_of_the_card_leaves_no_folder(
+    single: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egovcp_train.export.card_text", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main([f"--policy.path={single}", f"--output_dir={tmp_path / 'half'}"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_weight_beyond_the_range_is_refused_and_nothing_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -22,6 +22,7 @@ from egovcp.artifact import (
     write_artifact,
 )
 from egovcp.cli import run_command
+from egovcp.data.destination import resolve_root
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.files import write_text
 from egovcp.manifest import FORMAT_KEYS, PROCESSORS
@@ -63,11 +64,12 @@ def export(config: ExportConfig) -> None:
     if not config.policy.path or not config.output_dir:
         raise UsageError("--policy.path and --output_dir are needed: the policy, and a new folder")
     # Absolute: a relative path could be the name of a shipped policy, or have no last component.
-    output = prepare_output(config.output_dir, resume=False, resumable=False).absolute()
+    output = resolve_root(config.output_dir)
+    prepare_output(str(output), resume=False, resumable=False)
     artifact = load_artifact(config.policy.path, config.policy.revision)
     with replaced_folder(output) as work:
         write_half_precision(artifact, work)
-    write_text(output / CARD, card_text(load_artifact(str(output)), ""))
+        write_text(work / CARD, card_text(load_artifact(str(work)), "", output))
     echo(f"{output / WEIGHTS}: {(output / WEIGHTS).stat().st_size / 1e6:.1f} MB")
 
 

@@ -79,7 +79,7 @@ class TensorBoardLogger(Logger):
 
 
 class _RunLogger(Logger):
-    """Logs to a run of ``package``, which has the functions of wandb."""
+    """Logs to a run of ``package``, which has a wandb-compatible API."""
 
     def __init__(self, package: Any, run: Any) -> None:
         self._package, self._run = package, run
@@ -95,7 +95,8 @@ class _RunLogger(Logger):
 
 
 class TrackioLogger(_RunLogger):
-    """Logs to a run of the local Trackio; a resumed training continues that of its folder name."""
+    """Logs to Trackio on this machine; the run is named after the output folder; `--resume`
+    continues it."""
 
     def __init__(self, output: Path, project: str, options: Mapping[str, Any]) -> None:
         import trackio  # an optional package

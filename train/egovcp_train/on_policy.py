@@ -6,7 +6,7 @@ import contextlib
 import io
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.cli import save_config
+from egovcp.errors import DataError, UsageError
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import CONFIG_FILE, checkpoint_dir, new_checkpoint, restoring
@@ -48,6 +49,18 @@ class RslRlPpoConfig:
     """Clipping of the probability ratio."""
     entropy_coef: float = bounded(0.0, least=0)
     """Weight of the entropy bonus."""
+
+
+def require_mini_batches(robots: int, ppo: RslRlPpoConfig) -> None:
+    """Raise `UsageError` if a mini-batch would be empty, or the advantages would have no standard
+    deviation."""
+    found, expected = robots * ppo.num_steps_per_env, max(2, ppo.num_mini_batches)
+    if found < expected:
+        raise UsageError(
+            f"--robots={robots} times --ppo.num_steps_per_env={ppo.num_steps_per_env} are {found} "
+            f"ticks per iteration; expected at least {expected}, at least one for each of "
+            f"--ppo.num_mini_batches={ppo.num_mini_batches}"
+        )
 
 
 def rsl_rl_config(
@@ -149,6 +162,12 @@ class OnPolicyLearner(ABC):
         """Networks and optimiser; after a resume the robots start new episodes."""
         return {"ppo": self.ppo.save(), "iteration": self.iteration}
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all weights are finite."""
+        groups = self.ppo.optimizer.param_groups
+        return all(bool(x.isfinite().all()) for group in groups for x in group["params"])
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` has returned."""
         self.ppo.load(state["ppo"], None, strict=True)
@@ -175,6 +194,7 @@ def run_iterations(
 
     Raises:
         ArtifactError: the training state does not fit the options.
+        DataError: a weight is not finite.
         KeyboardInterrupt: a signal ended the run early.
     """
     if config.resume:
@@ -203,7 +223,8 @@ def run_iterations(
         ) as bar,
     ):
         while budget.progress(learner.steps) < 1.0 and not stopped:
-            scalars = learner.iterate()
+            with _divergence_reported(learner, output):
+                scalars = learner.iterate()
             if logger:
                 logger.log_scalars(learner.steps, scalars)
             bar.set_postfix(summary(scalars), refresh=False)
@@ -219,3 +240,23 @@ def run_iterations(
     echo(final_message(folder, "done" if finished else "stopped early"))
     if not finished:
         raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _divergence_reported(learner: OnPolicyLearner, output: Path) -> Iterator[None]:
+    """Raise `DataError` if a weight is not finite at the end of the block, or after an error in
+    it."""
+    number, failure = learner.iteration + 1, None
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:  # of sampling from a normal distribution
+        failure = error
+    if not learner.is_finite:
+        last = output / "checkpoints" / "last"
+        kept = f"the last checkpoint is {last.resolve()}" if last.exists() else "none was saved"
+        raise DataError(
+            f"PPO diverged in iteration {number}: a weight is not finite; {kept}; train again with "
+            "a lower --ppo.learning_rate"
+        ) from failure
+    if failure is not None:
+        raise failure

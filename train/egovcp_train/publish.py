@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.resources import files
 from itertools import chain, repeat
 from pathlib import Path
@@ -19,13 +19,10 @@ from egovcp.hub import (
     Content,
     Publication,
     PublishConfig,
-    Published,
     RetryPolicy,
     ensure_repository,
     is_repo_id,
-    publish,
 )
-from egovcp.outputs import write_report
 from egovcp.packages import SIMULATOR_MODULES, is_installed, versions_of
 from egovcp.robot_spec import RobotSpec
 from egovcp.terminal import echo
@@ -100,13 +97,7 @@ def push(config: PolicyPushConfig) -> None:
         )
     if not is_repo_id(config.repo_id):
         raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name, where to publish")
-    artifact = load_artifact(config.policy.path)
-    plain = publication(artifact, config.repo_id, config.private, config.message)
-    target = replace(plain, branch=config.branch, tag=config.tag)
-    published = publish(target, config.network)
-    report(target, published)
-    facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
-    write_report(config.json, {**facts, **asdict(published)})
+    publish_artifact(load_artifact(config.policy.path), config)
 
 
 # --- publication of a run ------------------------------------------------------------
@@ -124,22 +115,17 @@ def reserve_policy(policy: PolicyConfig) -> None:
         ensure_repository(target, RETRY_POLICY)
 
 
-def publication(
-    artifact: Artifact, repo_id: str, private: bool = False, message: str = ""
-) -> Publication:
-    """The artifact and its card as one commit, without other files of the folder."""
+def publish_artifact(artifact: Artifact, config: PublishConfig) -> None:
+    """Publish the artifact and its card as one commit, without other files of the folder, and print
+    how to use it."""
     folder = artifact.path
     names = [name for name in (*FILES, CURVES) if (folder / name).is_file()]
     contents = {name: Content(folder / name) for name in names}
-    contents[CARD] = Content(card_text(artifact, repo_id).encode())
-    return Publication(
-        repo_id=repo_id,
-        contents=contents,
-        message=message or f"policy after {artifact.manifest.get('step', '?')} steps",
-        owned=(ASSETS,),
-        private=private,
-        repo_type="model",
-    )
+    contents[CARD] = Content(card_text(artifact, config.repo_id).encode())
+    title = f"policy after {artifact.manifest.get('step', '?')} steps"
+    commit = config.publish(contents, title, owned=(ASSETS,), repo_type="model")
+    at = f"--policy.path={config.repo_id} --policy.revision={commit}"
+    echo(f"egovcp-eval {at} --task=... --output_dir=...")
 
 
 def publish_trained(folder: Path, policy: PolicyConfig) -> None:
@@ -149,8 +135,8 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
         EnvironmentFailure: it could not be published; the message has the command to repeat it.
     """
     try:
-        target = publication(load_artifact(str(folder)), policy.repo_id, policy.private)
-        report(target, publish(target, RETRY_POLICY))
+        target = PublishConfig(policy.repo_id, policy.private, network=RETRY_POLICY)
+        publish_artifact(load_artifact(str(folder)), target)
     except (EgovcpError, OSError) as error:
         private = ["--private"] if policy.private else []
         again = ["egovcp-push", f"--policy.path={folder}", f"--repo_id={policy.repo_id}", *private]
@@ -158,13 +144,6 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
             f"{error}; the trained policy is complete in {folder}, only publishing it failed; "
             f"repeat that with: {shlex.join(again)}"
         ) from error
-
-
-def report(target: Publication, published: Published) -> None:
-    """Print the commit and how to use it."""
-    name, commit = target.repo_id, published.commit
-    echo(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
-    echo(f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=...")
 
 
 # --- card ----------------------------------------------------------------------------
@@ -184,20 +163,22 @@ def write_card(folder: Path, run: Path, repo_id: str) -> None:
     write_text(folder / CARD, card_text(load_artifact(str(folder)), repo_id))
 
 
-def card_text(artifact: Artifact, repo_id: str) -> str:
+def card_text(artifact: Artifact, repo_id: str, folder: Path | None = None) -> str:
     """The card of a policy, from its manifest.
 
     Args:
         repo_id: id on the Hub, `user/name`, for the examples; empty: they name the folder, or the
             shipped policy.
+        folder: the folder that they name; None: that of the artifact.
     """
     from huggingface_hub import ModelCard
 
     manifest, robot = artifact.manifest, artifact.robot
     command = manifest.get("command")
-    found_versions = manifest.get("versions") or {"egovcp": manifest["egovcp_version"]}
-    folder = artifact.path.resolve()
-    local = folder.name if folder.parent == PRETRAINED.resolve() else str(artifact.path)
+    versions = manifest.get("versions") or {"egovcp": manifest["egovcp_version"]}
+    folder = folder or artifact.path
+    is_shipped = folder.resolve().parent == PRETRAINED.resolve()
+    local = folder.resolve().name if is_shipped else str(folder)
     title = repo_id.partition("/")[2] or "egovcp policy"
     card = ModelCard.from_template(
         _front_matter(manifest, title, robot),
@@ -211,7 +192,7 @@ def card_text(artifact: Artifact, repo_id: str) -> str:
         controller_id=artifact.controller_id,
         step=manifest.get("step", "an unknown number of"),
         command=shlex.join(command) if command else "not recorded",
-        versions=", ".join(f"{name} {number}" for name, number in found_versions.items()),
+        versions=", ".join(f"{name} {number}" for name, number in versions.items()),
         metrics=[
             (k, f"{v:.4g}", _METRICS.get(k, "")) for k, v in sorted(_metrics(manifest).items())
         ],

@@ -8,6 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from egovcp import spec
+from egovcp.bounds import bounded, check_bounds
 from egovcp.data import ReturnConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.model import WorldModelConfig
@@ -37,40 +38,36 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     """World model and losses."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Planner that turns the world model into actions."""
-    planner_seed: int = 0
+    planner_seed: int = bounded(0, least=0, below=2**63)
     """Seed of the planner's samples; `reset` restarts them."""
     save_predicted_video: bool = False
     """lerobot-eval writes ``pred_episode_N.mp4`` beside its videos: the depth image of the first
     robot reconstructed, and imagined 4, 8 and 16 steps ahead."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
-    sequence_length: int = 20
+    sequence_length: int = bounded(20, least=2, most=100_000)
     """Ticks per training window, which begins at the row that LeRobot draws."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric); without it, the planner
     evaluates no mirrored plans."""
-    drop_n_last_frames: int = 0
+    drop_n_last_frames: int = bounded(0, least=0)
     """Rows at the end of an episode at which no window begins. Windows are padded at the end."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_no_normalisation)
     """Identity: the world model normalises, with statistics among its weights."""
-    optimizer_lr: float = 1e-3
+    optimizer_lr: float = bounded(1e-3, above=0)
     """Peak learning rate."""
-    optimizer_weight_decay: float = 1e-3
+    optimizer_weight_decay: float = bounded(1e-3, least=0)
     """Decoupled weight decay."""
-    optimizer_grad_clip_norm: float = 10.0
+    optimizer_grad_clip_norm: float = bounded(10.0, above=0)
     """Largest gradient norm."""
-    scheduler_warmup_steps: int = 100
+    scheduler_warmup_steps: int = bounded(100, least=0)
     """Steps of linear warm-up."""
-    scheduler_decay_steps: int = 20_000
+    scheduler_decay_steps: int = bounded(20_000, least=1)
     """Steps of cosine decay to a tenth; a shorter run is decayed faster."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.sequence_length < 2 or self.drop_n_last_frames < 0:
-            raise UsageError(
-                f"--policy.sequence_length={self.sequence_length} and --policy.drop_n_last_frames="
-                f"{self.drop_n_last_frames}; expected at least 2 and 0"
-            )
+        check_bounds(self, "--policy.")
         self.returns.check("--policy.returns")
         if not self.mirror:  # the model has seen no mirrored scenes
             self.planner = replace(self.planner, mirror=False)

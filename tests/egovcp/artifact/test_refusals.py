@@ -72,6 +72,10 @@ def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
         (lambda m: m.pop("files"), "files is missing"),
         (lambda m: m.update(files=["a"]), r"files=\[a\]: expected \{NAME: text, ...\}"),
         (lambda m: m["files"].pop(WEIGHTS), f"{WEIGHTS}.*SHA-256"),
+        (lambda m: m.pop("egovcp_version"), "egovcp_version is missing"),
+        (lambda m: m.update(datasets=[{"revision": "a"}]), r"datasets\[0\].repo_id is missing"),
+        (lambda m: m.update(train_config={"datasets": "a"}), "train_config.datasets=a: expected"),
+        (lambda m: m.update(train_config={"dataset": {"root": 5}}), "root of a dataset .*=5"),
     ],
 )
 def test_a_manifest_of_something_else_is_refused(

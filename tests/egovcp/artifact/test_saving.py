@@ -118,7 +118,7 @@ def test_a_failing_rename_leaves_an_artifact(folder: Path, monkeypatch: pytest.M
     rename = Path.rename
 
     def fail(self: Path, target: Path) -> Path:
-        if target == folder and self.name.endswith(".partial"):
+        if target == folder and self.name == "new":
             raise OSError(5, "Input/output error")
         return rename(self, target)
 
@@ -127,6 +127,14 @@ def test_a_failing_rename_leaves_an_artifact(folder: Path, monkeypatch: pytest.M
         with pytest.raises(OSError, match="Input/output"):
             save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
     load_artifact(str(folder))
+
+
+def test_folders_beside_it_with_similar_names_are_left_alone(folder: Path) -> None:
+    others = {folder.with_name(f"{folder.name}{end}") for end in (".old", ".partial")}
+    for other in others:
+        other.mkdir()
+    save_artifact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert set(folder.parent.iterdir()) == {folder, *others}
 
 
 def test_provenance_without_a_controller_is_refused_before_writing(tmp_path: Path) -> None:

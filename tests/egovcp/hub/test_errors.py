@@ -1,6 +1,7 @@
 """Errors say what to do, and never the token."""
 
 import errno
+import ssl
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,13 @@ def test_a_full_disk_is_not_a_network_error() -> None:
     with pytest.raises(OSError, match="No space left") as caught, hub_errors("me/small"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.errno == errno.ENOSPC
+
+
+def test_missing_certificates_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", "/nonexistent")
+    with pytest.raises(EnvironmentFailure, match="SSL_CERT_FILE=/nonexistent"):  # noqa: SIM117
+        with hub_errors("me/small"):
+            ssl.create_default_context(cafile="/nonexistent")
 
 
 def test_an_upload_of_an_unreadable_file_is_not_a_network_error() -> None:

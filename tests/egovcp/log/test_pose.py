@@ -74,6 +74,19 @@ def test_quaternion_to_matrix_turns_x_to_y() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("fps", "0"), ("fps", "-25"), ("seed", "[1]"), ("hashes", "[1]"), ("versions", "5")),
+        *(("config", "[]"), ("camera", '{"position": [1]}'), ("camera", '{"vertical_fov": 0}')),
+        ("config", "[" * 10_000),
+    ],
+)
+def test_metadata_of_another_type_is_a_value_error(name: str, value: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}|nested"):
+        RunInfo.from_metadata(RunInfo("wall").to_metadata() | {name: value})
+
+
 def test_run_info_round_trips_through_metadata() -> None:
     info = RunInfo(
         "wall", 5, 6, camera=CameraView(position=(0.1, 0.2, 0.3)), config={"a": {"b": [1]}}

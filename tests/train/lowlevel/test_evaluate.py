@@ -1,6 +1,7 @@
 """``egovcp-eval-lowlevel``: what is commanded, what is measured, what is written."""
 
 import dataclasses
+import errno
 import json
 import signal
 from pathlib import Path
@@ -230,6 +231,33 @@ def test_a_diverging_simulation_is_an_error_and_writes_no_figures(
     message = capsys.readouterr().err.strip().splitlines()[-1]
     assert "the simulation diverged in skill squat, seed 1000, tick 0, robot 0" in message
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_json_is_written_before_the_table_is_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def fail(_: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(evaluate, "_play_all", lambda config, skills, out: out.update(squat={}))
+    monkeypatch.setattr(evaluate, "table", str)
+    monkeypatch.setattr(evaluate, "echo", fail)
+    with pytest.raises(OSError, match="No space left"):
+        evaluate.evaluate(evaluate.LowLevelEvalConfig(str(tmp_path), skills="squat"))
+    assert "squat" in json.loads((tmp_path / "lowlevel.json").read_text())
+
+
+def test_a_folder_in_the_place_of_the_json_is_refused_before_any_robot_plays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "lowlevel.json").mkdir()
+    assert main([f"--output_dir={tmp_path}"]) == 2
+    assert "lowlevel.json cannot be a file: found a folder" in capsys.readouterr().err
+
+
+def test_an_empty_output_folder_is_refused(capsys: pytest.CaptureFixture[str]):
+    assert main(["--output_dir="]) == 2
+    assert "--output_dir is empty" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,9 @@ def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[st
         (["--robots=0"], 2, "--robots"),
         (["--robot=8"], 2, "robot"),
         (["--task.episode=0.005"], 2, "--task.episode=0.005"),
+        (["--task.rewards.alive=1e308"], 2, "--task.rewards.alive=1e+308: expected at least"),
+        (["--network.actor=[]"], 2, "--network.actor=[]: expected at least one layer"),
+        (["--robots=1", "--ppo.num_steps_per_env=3"], 2, "are 3 ticks per iteration; expected at"),
         (["--resume"], 4, "no checkpoint to resume from"),
     ],
 )

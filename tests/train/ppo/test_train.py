@@ -78,6 +78,17 @@ def test_a_diverging_simulation_is_an_error_that_names_the_episode(
     assert "the simulation diverged in task ball, seed 0" in capsys.readouterr().err
 
 
+def test_a_diverging_training_is_an_error_and_its_weights_are_not_saved(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = [f"--output_dir={tmp_path}", "--steps=24", "--ppo.entropy_coef=1e39"]
+    assert main([*flags, *SMALL]) == 3
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "PPO diverged in iteration 1: a weight is not finite; none was saved" in message
+    assert "--ppo.learning_rate" in message
+    assert not (tmp_path / "checkpoints").exists()
+
+
 @pytest.mark.parametrize(
     ("flags", "code", "message"),
     [
@@ -86,6 +97,9 @@ def test_a_diverging_simulation_is_an_error_that_names_the_episode(
         (["--seed=1000000000"], 2, "are for evaluation"),
         (["--initial_std=0"], 2, "--initial_std"),
         (["--network.frames=0"], 2, "--network.frames=0: expected at least 1"),
+        (["--network.hidden=[]"], 2, "--network.hidden=[]: expected at least one layer"),
+        (["--robots=1", "--ppo.num_steps_per_env=3"], 2, "are 3 ticks per iteration; expected at"),
+        (["--robots=1", "--ppo.num_steps_per_env=1", "--ppo.num_mini_batches=1"], 2, "at least 2"),
         (["--env.ball.mass_range=[1,1e6]"], 2, "at least 0.001 and at most 10"),
         (["--resume"], 4, "no checkpoint to resume from"),
     ],

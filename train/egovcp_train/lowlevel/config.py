@@ -8,9 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from egovcp.bounds import bounded, check_bounds, check_ranges
+from egovcp.bounds import OutOfBounds, bounded, check_bounds, check_ranges
 
 Range = tuple[float, float]
+
+
+def _weight(default: float) -> float:
+    return bounded(default, least=-1e4, most=1e4)
 
 
 @dataclass(frozen=True)
@@ -90,37 +94,37 @@ class DisturbanceConfig:
 class RewardConfig:
     """Weights of the reward terms, per second; * marks the reference of a quantity."""
 
-    alive: float = 0.5
+    alive: float = _weight(0.5)
     """1 at every tick."""
-    velocity: float = 3.0
+    velocity: float = _weight(3.0)
     """exp(-|v - v*|^2 / 0.03) of the horizontal velocity v, m/s, averaged over 0.3 s."""
-    turning: float = 1.0
+    turning: float = _weight(1.0)
     """exp(-(w - w*)^2 / 0.1) of the yaw rate w, rad/s, averaged over 0.3 s."""
-    height: float = 1.0
+    height: float = _weight(1.0)
     """exp(-(z - z*)^2 / 0.001) of the pelvis height z, m."""
-    upright: float = 1.0
+    upright: float = _weight(1.0)
     """exp(-|u - u*|^2 / 0.03) of the vertical u in the pelvis frame; u*: at the natural pitch."""
-    contact: float = 1.0
+    contact: float = _weight(1.0)
     """Share of the feet that stand or swing as the phase of the gait requires."""
-    stepping: float = -1.0
+    stepping: float = _weight(-1.0)
     """Amount of gait, 0 to 1, without a commanded velocity; 0 in the 2 s after a push."""
-    torso_rate: float = -0.6
+    torso_rate: float = _weight(-0.6)
     """Squared angular velocity of the torso beyond the commanded turning, rad^2/s^2, at most 10."""
-    torso_change: float = -0.2
+    torso_change: float = _weight(-0.2)
     """Squared change of that angular velocity over a planner step, rad^2/s^2, at most 10."""
-    slip: float = -0.5
+    slip: float = _weight(-0.5)
     """Squared horizontal velocity of each standing foot, m^2/s^2, at most 4, summed."""
-    stance_width: float = -5.0
+    stance_width: float = _weight(-5.0)
     """By how much the lateral distance of the feet is below 0.16 m, m."""
-    foot_heading: float = -1.0
+    foot_heading: float = _weight(-1.0)
     """Squared sine of the yaw of each foot in the heading frame, summed."""
-    action: float = -0.02
+    action: float = _weight(-0.02)
     """Squared norm of the policy's action."""
-    action_rate: float = -0.02
+    action_rate: float = _weight(-0.02)
     """Squared norm of the change of the action per tick."""
-    torque: float = -1.0
+    torque: float = _weight(-1.0)
     """Mean of (torque / limit)^2 over the joints of legs and waist."""
-    fall: float = -100.0
+    fall: float = _weight(-100.0)
     """1 at the tick of a fall."""
 
 
@@ -148,6 +152,11 @@ class NetworkConfig:
     """Hidden layers of the critic, which also reads the true state of the simulation."""
     initial_std: float = bounded(0.3, above=0)
     """Initial standard deviation of the policy's actions."""
+
+    def __post_init__(self) -> None:
+        for name in ("actor", "critic"):
+            if not getattr(self, name):
+                raise OutOfBounds(name, (), "at least one layer")
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from egovcp.errors import UsageError, suggest
 from egovcp.eval_scores import wilson
 from egovcp.files import user_path, write_json
 from egovcp.hardware import available_cores
-from egovcp.outputs import require_writable
+from egovcp.outputs import require_output_file
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def evaluate(config: LowLevelEvalConfig) -> None:
-    """Play, print the table, write the JSON.
+    """Play, write the JSON, print the table.
 
     If it ends early, the results of the robots that have played are written, marked incomplete.
 
@@ -90,8 +90,10 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     if config.videos:
         require_packages("egovcp-train", "--videos", "matplotlib", "rerun")
     controller = make_controller(config.controller)
+    if not config.output_dir:
+        raise UsageError("--output_dir is empty; expected a folder")
     output = user_path(config.output_dir)
-    require_writable(output)
+    require_output_file(str(output / RESULT), "--output_dir")
     figures: dict[str, dict[str, Any]] = {}
     complete = False
     try:
@@ -105,6 +107,8 @@ def evaluate(config: LowLevelEvalConfig) -> None:
                 "seed": config.seed,
                 "complete": complete,
             }
+            output.mkdir(parents=True, exist_ok=True)
+            write_json(output / RESULT, figures | {"_run": run})
             echo(table(figures))
             if not complete:
                 played = {skill.name: figures.get(skill.name, {}) for skill in skills}
@@ -112,8 +116,6 @@ def evaluate(config: LowLevelEvalConfig) -> None:
                     f"{k} {f.get('episodes', 0)} of {config.episodes}" for k, f in played.items()
                 )
                 echo(f"INCOMPLETE: {', '.join(counts)} robots have played")
-            output.mkdir(parents=True, exist_ok=True)
-            write_json(output / RESULT, figures | {"_run": run})
             echo(f"metrics: {output / RESULT}")
 
 

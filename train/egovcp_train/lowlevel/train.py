@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig, require_memory_for_robots
 from egovcp_train.checkpoint import load_training_state, prepare_output, resumed_options
 from egovcp_train.lowlevel.config import CurriculumConfig, LowLevelTask, NetworkConfig
-from egovcp_train.on_policy import RslRlPpoConfig, run_iterations
+from egovcp_train.on_policy import RslRlPpoConfig, require_mini_batches, run_iterations
 
 PROG = "egovcp-train-lowlevel"
 POLICY_FILE = "walk.safetensors"
@@ -106,6 +107,7 @@ def train(config: LowLevelTrainConfig) -> None:
         ArtifactError: the file of --init cannot be used.
         KeyboardInterrupt: a signal ended it early; the checkpoint is written.
     """
+    require_mini_batches(config.robots, config.ppo)
     require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
     threads = config.threads or available_cores()
@@ -121,7 +123,7 @@ def train(config: LowLevelTrainConfig) -> None:
         return (
             f"{PROG}: {outcome} after {learner.steps} steps, difficulty {difficulty:.2f}\n"
             f"controller: {final}\n"
-            f"next: egovcp-eval-lowlevel --controller={final} --output_dir=..."
+            f"next: egovcp-eval-lowlevel --controller={shlex.quote(str(final))} --output_dir=..."
         )
 
     with contextlib.closing(learner.env):

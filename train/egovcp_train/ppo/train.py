@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from egovcp.sim.scenario import require_training_seed
 from egovcp.sim.tasks.registry import DEFAULT_TASK, select_tasks
 from egovcp.spec import GAMMA
 from egovcp_train.checkpoint import load_training_state, prepare_output, resumed_options
-from egovcp_train.on_policy import RslRlPpoConfig, run_iterations
+from egovcp_train.on_policy import RslRlPpoConfig, require_mini_batches, run_iterations
 
 PROG = "egovcp-train-ppo"
 POLICY_FILE = "ppo.safetensors"
@@ -98,6 +99,7 @@ def train(config: PpoTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: a signal ended it early; the checkpoint is written.
     """
+    require_mini_batches(config.robots, config.ppo)
     require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
     make_controller(config.env.controller)  # raises before the simulator is imported
@@ -116,7 +118,8 @@ def train(config: PpoTrainConfig) -> None:
         return (
             f"{PROG}: {outcome} after {learner.steps} steps\n"
             f"policy: {final}\n"
-            f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=..."
+            f"next: egovcp-eval --controllers=ppo --ppo.path={shlex.quote(str(final))} --task=... "
+            "--output_dir=..."
         )
 
     with contextlib.closing(learner.env):
