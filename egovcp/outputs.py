@@ -77,6 +77,14 @@ def require_output_file(file: str, option: str) -> None:
         raise EnvironmentFailure(f"{named}: {error}") from error
 
 
+def require_no_input(file: str, option: str, *inputs: Path) -> None:
+    """Raise `UsageError` if ``file`` is one of the ``inputs``, or lies in one that is a folder."""
+    path = user_path(file).resolve()
+    for source in (source.resolve() for source in inputs if file):
+        if path == source or path.is_relative_to(source):
+            raise UsageError(f"{option}={as_flag_value(file)} is part of the input; name another")
+
+
 def require_writable(folder: Path) -> None:
     """Raise unless files can be created in ``folder``, or the folder itself can be created.
 

@@ -34,6 +34,7 @@ _EPISODE_COLUMNS = (
 _EPISODES: Final = 10_000_000
 _TASKS: Final = 10_000
 _RECORD_BYTES: Final = 32_768  # 20 times the record of an episode
+_NUMBERS: Final = ("seed", "episode", "event_tick", "camera_pitch")  # in the metadata, optional
 _LARGEST_LIMIT: Final = 2**31 - 1
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 #: Column of the task names if their index has no name, as in files of LeRobot 0.4.
@@ -286,10 +287,24 @@ def record_problems(record: object, length: int | None = None) -> Iterator[str]:
         yield f"its time_limit is {limit!r}, expected 1 to {_LARGEST_LIMIT} ticks"
     if not isinstance(digest, str) or (digest and not _DIGEST.fullmatch(digest)):
         yield f"its sha256 is {digest!r}, expected 64 hexadecimal digits"
-    if not isinstance(record.get("metadata", {}), Mapping):
-        yield "its metadata is not an object"
+    facts = record.get("metadata", {})
+    yield from (
+        _fact_problems(facts) if isinstance(facts, Mapping) else ["its metadata is no object"]
+    )
     if length is not None and record.get("length", length) != length:
         yield f"its record says {record['length']} frames, but meta/episodes says {length}"
+
+
+def _fact_problems(facts: Mapping[str, Any]) -> Iterator[str]:
+    for name in _NUMBERS:
+        if not isinstance(facts.get(name), int | float | None):
+            yield f"its {name} is {facts[name]!r}, expected a number"
+    terms, ticks = (facts.get(name, {}) for name in ("reward_terms", "contact_ticks"))
+    sums = terms.values() if isinstance(terms, Mapping) else [terms]
+    if not all(isinstance(term, Mapping) and term.keys() >= {"ticks", "sum"} for term in sums):
+        yield "its reward_terms have no ticks and sum"
+    if not isinstance(ticks, Mapping) or not all(isinstance(n, int) for n in ticks.values()):
+        yield "its contact_ticks are no numbers"
 
 
 def load_hashes(root: Path) -> Mapping[str, str]:

@@ -49,6 +49,15 @@ def parse_provenance(content: object, path: str | Path, where: str = "") -> Prov
             raise DataError.at(path, f"{where}its {key} is a {found}, expected {kind}")
     if not all(isinstance(version, str) for version in content.get("versions", {}).values()):
         raise DataError.at(path, f"{where}its versions are not strings")
+    config = content.get("config", {})
+    env = config.get("env", {})
+    groups = [env, env.get("camera", {})] if isinstance(env, dict) else [env]
+    if not all(isinstance(group, dict) for group in groups):
+        raise DataError.at(path, f"{where}its config.env holds no options")
+    ticks, boundary = config.get("step_ticks", [1, 1]), config.get("boundary", "")
+    numbers = isinstance(ticks, list | tuple) and [type(n) for n in ticks] == [int, int]
+    if not numbers or not isinstance(boundary, str):
+        raise DataError.at(path, f"{where}its config.step_ticks or config.boundary is invalid")
     names = [field.name for field in fields(Provenance)]
     return Provenance(**{key: content[key] for key in names if key in content})
 

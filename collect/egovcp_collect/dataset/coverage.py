@@ -16,7 +16,7 @@ from egovcp.data.source import locate
 from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
-from egovcp.outputs import output_file, write_report
+from egovcp.outputs import output_file, require_no_input, require_writable, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.statistics import (
@@ -91,10 +91,13 @@ def run_coverage(config: CoverageConfig) -> None:
         DataError: a file is damaged, or a value is not finite.
     """
     config.returns.check()
+    folder = user_path(config.output_dir)
     if config.output_dir:
         require_matplotlib()
+        require_writable(folder)
     source = locate(config.dataset)
     root = source.root
+    require_no_input(config.json, "--json", root / "data", root / "meta")
     reader = DatasetReader.open_source(source) if is_own(root) else None
     if reader is None or not reader.robot.is_g1:
         if config.output_dir:
@@ -106,6 +109,13 @@ def run_coverage(config: CoverageConfig) -> None:
         return
     statistics = compute_statistics(reader, config.returns)
     checks = assess(statistics)
+    assessment = {
+        "suitable": all(check.passed for check in checks),
+        "summary": summary(checks),
+        "checks": [asdict(check) for check in checks],
+    }
+    tasks = {task.task: asdict(task) for task in statistics.tasks}
+    write_report(config.json, {"tasks": tasks, "assessment": assessment})
     echo(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} frames\n")
     for task in statistics.tasks:
         echo_lines([*_describe(task), ""])
@@ -114,16 +124,8 @@ def run_coverage(config: CoverageConfig) -> None:
         echo(f"  {'ok  ' if check.passed else 'warn'}  {check.task}: {check.text}")
     echo(f"  {summary(checks)}")
     if config.output_dir:
-        folder = user_path(config.output_dir)
         for path in draw_figures(statistics, config.returns, folder):
             echo(f"wrote {path}")
-    assessment = {
-        "suitable": all(check.passed for check in checks),
-        "summary": summary(checks),
-        "checks": [asdict(check) for check in checks],
-    }
-    tasks = {task.task: asdict(task) for task in statistics.tasks}
-    write_report(config.json, {"tasks": tasks, "assessment": assessment})
 
 
 def coverage_texts(task: TaskStatistics) -> dict[str, str]:

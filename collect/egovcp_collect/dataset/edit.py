@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate, select_episodes
 from egovcp.errors import UsageError
-from egovcp.outputs import output_file, write_report
+from egovcp.files import removed_on_error
+from egovcp.outputs import output_file, require_no_input, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.rewrite import new_folder
 from egovcp_collect.dataset.subset import write_subset
@@ -61,6 +63,7 @@ class SplitConfig:
 def run_delete(config: DeleteConfig) -> None:
     """Write the new dataset."""
     reader, count = _open(config.dataset)
+    require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
     if not config.episodes:
         raise UsageError("--episodes is missing; name the episodes to leave out, '[3, 7]'")
     left_out = select_episodes(config.episodes, count, "--episodes").tolist()
@@ -68,12 +71,15 @@ def run_delete(config: DeleteConfig) -> None:
     if not kept:
         raise UsageError(f"--episodes={config.episodes} leaves no episode of {count}")
     output = new_folder(config.output_dir, [reader.root])
-    write_report(config.json, _write(reader, kept, output))
+    result = _write(reader, kept, output)
+    write_report(config.json, result)
+    _print(output, result)
 
 
 def run_split(config: SplitConfig) -> None:
     """Write the new datasets."""
     reader, count = _open(config.dataset)
+    require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
     total = sum(config.splits.values())
     valid_names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
     valid_shares = all(0 < share <= 1 for share in config.splits.values())
@@ -89,11 +95,17 @@ def run_split(config: SplitConfig) -> None:
         end = math.floor(share * count + 0.5)
         if end <= first:
             raise UsageError(f"--splits: {name} would have none of the {count} episodes")
-        output = str(Path(config.output_dir) / name) if config.output_dir else ""
+        folder = str(Path(config.output_dir) / name) if config.output_dir else ""
         kept = sorted(order[first:end].tolist())
-        parts[name], first = (kept, new_folder(output, [reader.root])), end
-    result = {name: _write(reader, kept, output) for name, (kept, output) in parts.items()}
+        parts[name], first = (kept, new_folder(folder, [reader.root])), end
+    result = {}
+    with ExitStack() as finished:
+        for name, (kept, output) in parts.items():
+            result[name] = _write(reader, kept, output)
+            finished.enter_context(removed_on_error(output))
     write_report(config.json, result)
+    for name, (_, output) in parts.items():
+        _print(output, result[name])
 
 
 def _open(config: DatasetConfig) -> tuple[DatasetReader | LeRobotReader, int]:
@@ -118,5 +130,8 @@ def _write(
         episodes, frames = len(kept), writer.num_frames
     else:
         episodes, frames = write_subset(reader, kept, output)
-    echo(f"{output}: {episodes} episodes, {frames} frames")
     return {"episodes": episodes, "frames": frames}
+
+
+def _print(output: Path, result: Mapping[str, int]) -> None:
+    echo(f"{output}: {result['episodes']} episodes, {result['frames']} frames")

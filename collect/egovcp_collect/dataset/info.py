@@ -12,7 +12,7 @@ from egovcp.data.index import in_split
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.provenance import source_provenances
 from egovcp.data.source import Source, locate
-from egovcp.outputs import output_file, write_report
+from egovcp.outputs import output_file, require_no_input, write_report
 from egovcp.terminal import echo_lines
 
 
@@ -32,12 +32,13 @@ class DatasetInfoConfig:
 def run_info(config: DatasetInfoConfig) -> None:
     """Print the information."""
     source = locate(config.dataset)
+    require_no_input(config.json, "--json", source.root / "data", source.root / "meta")
     if is_own(source.root):
         info = describe(DatasetReader.open_source(source))
     else:
         info = describe_other(LeRobotReader.open(source.root), source)
-    echo_lines(_table(info))
     write_report(config.json, info)
+    echo_lines(_table(info))
 
 
 def describe(reader: DatasetReader) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from egovcp.data.source import Source, local_root, require_folder
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
-from egovcp.outputs import output_file, write_report
+from egovcp.outputs import output_file, require_no_input, write_report
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo, echo_lines, one_line
 from egovcp_collect.dataset.check import problem_as_json
@@ -103,6 +103,8 @@ def run_merge(config: MergeConfig) -> None:
     datasets = (config.dataset, *(DatasetConfig(root=other) for other in config.others))
     readers = [DatasetReader.open(dataset) for dataset in datasets]
     output = new_folder(config.output_dir, [reader.root for reader in readers])
+    for reader in readers:
+        require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
     require_one_controller({reader.root: reader.controller_id for reader in readers})
     chosen, dropped = _distinct_episodes(readers, config.duplicates)
     roots = [str(reader.root) for reader in readers]
@@ -181,6 +183,7 @@ def run_repair(config: RepairConfig) -> None:
     root = local_root(config.dataset)
     require_folder(root)
     output = new_folder(config.output_dir, [root])
+    require_no_input(config.json, "--json", root / "data", root / "meta")
     given = config.records.split(",") if isinstance(config.records, str) else config.records
     originals = [user_path(name).absolute() for name in given if name]
     if not is_own(root) and not originals:
@@ -196,13 +199,14 @@ def run_repair(config: RepairConfig) -> None:
         episodes = _valid_episodes(root, robot or G1, records, dropped)
         for episode in tqdm(episodes, unit="ep", delay=1):
             writer.add(episode)
-        result = _report(config, root, writer, dropped, "" if robot else assumed)
-    echo(f"{output}: {result}")
+        if not writer.num_episodes:
+            _report(config, root, writer, dropped, "" if robot else assumed)
+    echo(f"{output}: {_report(config, root, writer, dropped)}")
 
 
 def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
     """Write the valid episodes of a dataset that egovcp did not collect."""
-    reader, dropped = LeRobotReader(root), list[DataError]()
+    reader, dropped, shortened = LeRobotReader(root), list[DataError](), list[str]()
     with new_dataset(output) as folder:
         writer = SubsetWriter(reader, folder)
         for found in scan_episodes(reader):
@@ -211,11 +215,12 @@ def _repair_other(config: RepairConfig, root: Path, output: Path) -> None:
                 continue
             writer.add(found)
             if error := found.length_problem:
-                echo(one_line(f"kept: {error}"))
-        echo_lines(f"not checked: {note}" for note in LeRobotCheck(reader).notes())
-        result = _report(config, root, writer, dropped)
+                shortened.append(one_line(f"kept: {error}"))
+        if not writer.num_episodes:
+            _report(config, root, writer, dropped)
         writer.finish()
-    echo(f"{output}: {result}")
+    echo_lines([*shortened, *(f"not checked: {note}" for note in LeRobotCheck(reader).notes())])
+    echo(f"{output}: {_report(config, root, writer, dropped)}")
 
 
 def _report(

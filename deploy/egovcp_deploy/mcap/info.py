@@ -17,7 +17,7 @@ from egovcp.files import user_path
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.log.tick import MODES
-from egovcp.outputs import STDOUT, output_file, write_report
+from egovcp.outputs import STDOUT, output_file, require_no_input, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
 from egovcp.terminal import echo, echo_lines
@@ -151,7 +151,10 @@ def run(config: RecordingInfoConfig) -> None:
     """Print the summary; then raise `DataError` if the recording is damaged."""
     if not config.file:
         raise UsageError("no recording given; usage: egovcp-mcap info FILE")
-    report, reader = summarise(user_path(config.file))
+    path = user_path(config.file)
+    if config.json != STDOUT:
+        require_no_input(config.json, "--json", path)
+    report, reader = summarise(path)
     if config.json == STDOUT:
         echo(json.dumps(report, indent=2))
     else:

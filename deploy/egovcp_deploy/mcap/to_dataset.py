@@ -18,7 +18,7 @@ from egovcp.files import user_path
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
 from egovcp.packages import DATA_MODULES, require_packages
-from egovcp.terminal import echo
+from egovcp.terminal import echo, echo_lines
 from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
@@ -75,12 +75,14 @@ def run(config: ToDatasetConfig) -> None:
         _convert_topics(config, paths, root)
         return
     seen: list[tuple[Path, list[bytes]]] = []
+    converted = []
     with DatasetWriter(root, provenance(paths)) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             require_different(path, episode, seen)
             writer.add(episode)
-            echo(f"{path}: {len(episode)} ticks{cut}")
+            converted.append(f"{path}: {len(episode)} ticks{cut}")
+    echo_lines(converted)
     echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
 
 
@@ -104,7 +106,7 @@ def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) 
     with new_dataset(root) as folder:
         dataset: Any = None
         shapes: dict[str, tuple[int, ...]] = {}
-        for recording, kept, gap in recordings:
+        for recording, kept, _ in recordings:
             for row in islice(recording.rows(shapes), kept):
                 if dataset is None:  # an empty one is false
                     features = _features(row, mapping)
@@ -114,9 +116,12 @@ def _convert_topics(config: ToDatasetConfig, paths: Sequence[Path], root: Path) 
                     )
                 dataset.add_frame({**row, "task": mapping.task})
             dataset.save_episode()
-            echo(f"{recording.path}: {kept} rows{f', cut: {gap}' if gap else ''}")
         dataset.finalize()
-        echo(f"{root}: {dataset.num_episodes} episodes, {dataset.num_frames} frames")
+    echo_lines(
+        f"{recording.path}: {kept} rows{f', cut: {gap}' if gap else ''}"
+        for recording, kept, gap in recordings
+    )
+    echo(f"{root}: {dataset.num_episodes} episodes, {dataset.num_frames} frames")
 
 
 def _features(row: Mapping[str, Array], mapping: TopicMapping) -> dict[str, Any]:

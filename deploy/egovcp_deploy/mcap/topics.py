@@ -72,9 +72,13 @@ class TopicMapping:
         """Read a YAML or JSON file; raises `UsageError`."""
         try:
             found = build(cls, read_config(path), "")
-            for key in found.features:
-                if key in INDEX_FEATURES or "/" in key:
+            for key, sources in found.features.items():
+                if key in (*INDEX_FEATURES, "", "task") or "/" in key:
                     raise ValueError(f"{key!r} cannot be the name of a feature; rename it")
+                if not sources:
+                    raise ValueError(f"features.{key} names no topic")
+            if unknown := found.names.keys() - found.features.keys():
+                raise ValueError(f"names has {sorted(unknown)}, which features has not")
             if found.fps < 1 or not found.features or not found.task:
                 raise ValueError("expected fps of at least 1, a task, and features")
         except (OSError, UnsafeFileError, ValueError, UsageError) as error:

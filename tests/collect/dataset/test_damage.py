@@ -1,9 +1,10 @@
 """`egovcp-dataset check` and loading for training find each kind of damage and name the file."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -33,6 +34,10 @@ class Case:
     """Loading for training must raise, too."""
     by_hash: bool = False
     """Found only by the recorded hashes."""
+
+
+def _config(**options: object) -> Callable[[Any], object]:
+    return lambda content: content.setdefault("config", {}).update(options)
 
 
 _WIDE = pa.list_(pa.float64(), spec.STATE_DIM)
@@ -130,6 +135,10 @@ CASES = [
     Case("other tasks", d.column("task", d.put(0, "juggle"), TASKS), DATA, 0, 0),
     # what collection.json says
     Case("record missing", d.edit(COLLECTION, lambda c: c["episodes"].pop()), COLLECTION),
+    Case("scene no object", d.edit(COLLECTION, _config(env=[1])), COLLECTION),
+    Case("camera no object", d.edit(COLLECTION, _config(env={"camera": 1})), COLLECTION),
+    Case("walk no pair", d.edit(COLLECTION, _config(step_ticks=5)), COLLECTION),
+    Case("walk no boundary", d.edit(COLLECTION, _config(boundary=[1])), COLLECTION),
     Case("records no list", d.edit(COLLECTION, lambda c: c.update(episodes={})), COLLECTION),
     Case(
         "record no object",
@@ -142,6 +151,10 @@ CASES = [
     Case("time limit as text", d.record(1, time_limit="12"), COLLECTION, 1),
     Case("time limit too short", d.record(1, time_limit=3), DATA, 1),
     Case("length in the record", d.record(1, length=8), COLLECTION, 1),
+    Case("seed as text", d.record(1, metadata={"seed": "abc"}), COLLECTION, 1),
+    Case("sums of rewards a list", d.record(1, metadata={"reward_terms": [1]}), COLLECTION, 1),
+    Case("sum of a reward", d.record(1, metadata={"reward_terms": {"a": 3}}), COLLECTION, 1),
+    Case("contacts as text", d.record(1, metadata={"contact_ticks": {"a": ""}}), COLLECTION, 1),
     Case("digest of another", d.record(1, sha256="0" * 64), DATA, 1),
     Case("digest no digest", d.record(1, sha256=7), COLLECTION, 1),
     Case("no controller", d.edit(COLLECTION, lambda c: c.pop("controller_id")), COLLECTION),

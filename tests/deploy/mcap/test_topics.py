@@ -138,6 +138,10 @@ def test_a_mapping_that_does_not_fit_is_refused(
         ({"fsp": 20}, "unknown option fsp"),
         ({"task": ""}, "a task"),
         ({"features": {"timestamp": "/reward"}}, "'timestamp' cannot be the name"),
+        ({"features": {"task": "/reward"}}, "'task' cannot be the name"),
+        ({"features": {"": "/reward"}}, "'' cannot be the name"),
+        ({"features": {"action": []}}, "features.action names no topic"),
+        ({"names": {"acton": ["x"]}}, "names has ['acton'], which features has not"),
         ({"names": {"action": ["x", "y"]}}, "names.action of the mapping: 2 of 1 values"),
     ],
 )
