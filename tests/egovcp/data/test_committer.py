@@ -420,7 +420,7 @@ def test_episodes_staged_before_a_removal_are_committed(
     [
         ({"seed": 0, "episode": 0}, DataError, "is number 0 of the collection, as episode"),
         ({"seed": 1, "episode": 1}, UsageError, "several collections and cannot be extended"),
-        ({"seed": 0, "episode": "1"}, DataError, "its number is '1', expected an integer"),
+        ({"seed": 0, "episode": 1.5}, DataError, "its number is 1.5, expected an integer"),
         ({"seed": 0, "episode": True}, DataError, "its number is True, expected an integer"),
     ],
 )
