@@ -77,7 +77,7 @@ def require_output_file(file: str, option: str) -> None:
         raise EnvironmentFailure(f"{named}: {error}") from error
 
 
-def require_no_input(file: str, option: str, *inputs: Path) -> None:
+def require_not_input(file: str, option: str, *inputs: Path) -> None:
     """Raise `UsageError` if ``file`` is one of the ``inputs``, or lies in one that is a folder."""
     path = user_path(file).resolve()
     for source in (source.resolve() for source in inputs if file):

@@ -15,7 +15,7 @@ from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
-from draccus.parsers.yaml_loader import SafeLoaderWithInclusion
+import yaml
 
 from egovcp.bounds import OutOfBounds, as_flag_value
 from egovcp.errors import UsageError, did_you_mean
@@ -35,7 +35,7 @@ _MAIN_OPTIONS: Final = ("root", "path", "type")
 _SHOWN_OPTIONS: Final = 6
 
 
-class _YamlLoader(SafeLoaderWithInclusion):
+class _YamlLoader(yaml.SafeLoader):  # type: ignore[misc]
     """Refuses keys that are not text, and keys that are given twice."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def parse_collection(text: str) -> Any:
     if stripped.startswith("(") and stripped.endswith(")"):
         text = f"[{stripped[1:-1]}]"
     try:
-        loader = _YamlLoader(text)  # type: ignore[no-untyped-call]
+        loader = _YamlLoader(text)
         node = loader.get_single_node()
         return None if node is None else loader.construct_object(node, deep=True)
     except WrongValue:

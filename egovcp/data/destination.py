@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.files import user_path
-from egovcp.outputs import nearest_existing, require_writable
+from egovcp.outputs import nearest_existing, require_not_input, require_writable
 
 
 def resolve_root(root: str | Path) -> Path:
@@ -51,6 +51,11 @@ def require_new(root: Path) -> None:
         raise _below_file(root)
     require_writable(root.parent)
     require_replaceable(root)
+
+
+def require_outside(root: Path, file: str, option: str = "--json") -> None:
+    """Raise `UsageError` if the output ``file`` would be part of the dataset ``root``."""
+    require_not_input(file, option, root / "data", root / "meta")
 
 
 def require_replaceable(root: Path) -> None:

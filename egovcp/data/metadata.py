@@ -288,23 +288,26 @@ def record_problems(record: object, length: int | None = None) -> Iterator[str]:
     if not isinstance(digest, str) or (digest and not _DIGEST.fullmatch(digest)):
         yield f"its sha256 is {digest!r}, expected 64 hexadecimal digits"
     facts = record.get("metadata", {})
-    yield from (
-        _fact_problems(facts) if isinstance(facts, Mapping) else ["its metadata is no object"]
-    )
+    if isinstance(facts, Mapping):
+        yield from _metadata_problems(facts)
+    else:
+        yield "its metadata is not an object"
     if length is not None and record.get("length", length) != length:
         yield f"its record says {record['length']} frames, but meta/episodes says {length}"
 
 
-def _fact_problems(facts: Mapping[str, Any]) -> Iterator[str]:
+def _metadata_problems(facts: Mapping[str, Any]) -> Iterator[str]:
+    """Values of a wrong type, of those that are read; `decode` would take a second for a dataset of
+    10 000 episodes."""
     for name in _NUMBERS:
         if not isinstance(facts.get(name), int | float | None):
             yield f"its {name} is {facts[name]!r}, expected a number"
     terms, ticks = (facts.get(name, {}) for name in ("reward_terms", "contact_ticks"))
     sums = terms.values() if isinstance(terms, Mapping) else [terms]
     if not all(isinstance(term, Mapping) and term.keys() >= {"ticks", "sum"} for term in sums):
-        yield "its reward_terms have no ticks and sum"
+        yield "its reward_terms are not objects with ticks and sum"
     if not isinstance(ticks, Mapping) or not all(isinstance(n, int) for n in ticks.values()):
-        yield "its contact_ticks are no numbers"
+        yield "its contact_ticks are not integers"
 
 
 def load_hashes(root: Path) -> Mapping[str, str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from egovcp.data import schema
+from egovcp.decode import DecodeError, require_type
 from egovcp.errors import DataError
 
 
@@ -50,14 +51,13 @@ def parse_provenance(content: object, path: str | Path, where: str = "") -> Prov
     if not all(isinstance(version, str) for version in content.get("versions", {}).values()):
         raise DataError.at(path, f"{where}its versions are not strings")
     config = content.get("config", {})
-    env = config.get("env", {})
-    groups = [env, env.get("camera", {})] if isinstance(env, dict) else [env]
-    if not all(isinstance(group, dict) for group in groups):
-        raise DataError.at(path, f"{where}its config.env holds no options")
-    ticks, boundary = config.get("step_ticks", [1, 1]), config.get("boundary", "")
-    numbers = isinstance(ticks, list | tuple) and [type(n) for n in ticks] == [int, int]
-    if not numbers or not isinstance(boundary, str):
-        raise DataError.at(path, f"{where}its config.step_ticks or config.boundary is invalid")
+    try:
+        require_type(env := config.get("env", {}), dict[str, Any], "config.env")
+        require_type(env.get("camera", {}), dict[str, Any], "config.env.camera")
+        require_type(config.get("step_ticks", [1, 1]), tuple[int, int], "config.step_ticks")
+        require_type(config.get("boundary", ""), str, "config.boundary")
+    except DecodeError as error:
+        raise DataError.at(path, f"{where}{error}") from error
     names = [field.name for field in fields(Provenance)]
     return Provenance(**{key: content[key] for key in names if key in content})
 

@@ -29,7 +29,7 @@ RESULT: Final = "result.json"
 #: includes its search.
 _EPISODE_MINUTES: Final = {"hold": 0.003, "random": 0.003, "oracle": 0.003, "constant": 0.03}
 #: Minutes of an episode of a study that simulates many variations of it.
-_STUDY_MINUTES: Final = {"residuals": 0.15}
+_STUDY_MINUTES: Final = {"residuals": 0.15, "plan_terms": 0.1}
 
 type Flags = Mapping[str, Any]
 """Name of a flag without dashes -> text, number, bool, list or mapping; references at any depth."""

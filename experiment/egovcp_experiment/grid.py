@@ -67,6 +67,11 @@ class Grid:
         tasks = self.config.tasks
         return ALL if len(tasks) > 1 else tasks[0]
 
+    def given_policy(self, task: str) -> str:
+        """The policy of ``--train.policies`` for a task, or `ALL`; empty: none."""
+        given = self.config.train.policies
+        return given.get(task) or (given.get(ALL, "") if task == self.trained_on else "")
+
     @property
     def cells(self) -> list[Cell]:
         """All requested cells, each after those it needs."""
@@ -103,9 +108,8 @@ class Grid:
         self, task: str, seed: int, model: Model = _DEFAULT_MODEL
     ) -> CellOutput | ExternalPath:
         """Artifact of a model trained on a task, or on `ALL`."""
-        policies = self.config.train.policies
-        if task in policies and not model.flags:
-            path = policies[task]
+        path = self.given_policy(task)
+        if path and not model.flags:
             shipped = path in shipped_policies()
             return ExternalPath(str(policy_folder(path)) if shipped else path)
         return CellOutput(self.train(task, seed, model).name, ARTIFACT)

@@ -65,7 +65,7 @@ class CellScheduler:
 
     @property
     def outlook(self) -> str:
-        """How many cells are left, and about how long they take: estimates of their commands,
+        """How many cells are left, and about how long they take: the estimates of their commands,
         scaled by the times of complete cells of the same command."""
         factors = {}
         for command in dict.fromkeys(cell.command for cell in self._cells):
@@ -74,6 +74,8 @@ class CellScheduler:
             measured = sum(self.records[cell.name]["minutes"] for cell in done)
             factors[command.prog] = measured / estimated if estimated else 1.0
         left = [cell for cell in self._cells if cell.name not in self.records]
+        if not left:
+            return "all done"
         minutes = sum(c.command.minutes(c.flags) * factors[c.command.prog] for c in left)
         spent = sum(process.minutes for process in self._running)
         return f"{len(left)} to go, {_in_words(max(0.0, minutes - spent) / self._jobs)}"

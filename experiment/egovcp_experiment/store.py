@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.destination import writer_lock
+from egovcp.decode import DecodeError, require_type
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.files import UnsafeFileError, read_json, write_json
 from egovcp.values import differences
@@ -38,7 +39,12 @@ from egovcp_experiment.local_runner import versions
 _CELLS: Final = "cells"
 _LIMIT_BYTES: Final = 1 << 28  # of a result, which may hold images and maps
 #: Entries of a result that are read.
-_ENTRIES: Final = {"settings": dict, "sha256": str, "figures": dict, "minutes": float}
+_ENTRIES: Final[Mapping[str, Any]] = {
+    "settings": dict[str, Any],
+    "sha256": str,
+    "figures": dict[str, Any],
+    "minutes": float,
+}
 
 
 class CellStore:
@@ -169,9 +175,10 @@ class CellStore:
 
 def _read_record(path: Path) -> Record:
     try:
-        record = read_json(path, _LIMIT_BYTES)
-    except UnsafeFileError as error:
-        record = str(error)
-    if isinstance(record, dict) and all(isinstance(record.get(k), t) for k, t in _ENTRIES.items()):
-        return record
-    raise DataError(f"{path} is damaged; remove it to run its cell again")
+        require_type(record := read_json(path, _LIMIT_BYTES), dict[str, Any], "the result")
+        for name, kind in _ENTRIES.items():
+            require_type(record.get(name), kind, name)
+    except (UnsafeFileError, DecodeError) as error:
+        raise DataError(f"{path} is damaged: {error}; remove it to run its cell again") from error
+    found: Record = record
+    return found

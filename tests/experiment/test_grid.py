@@ -92,6 +92,10 @@ def test_existing_data_and_policies_are_used() -> None:
     ]
     assert grid.cells[0].flags["dataset.root"] == ExternalPath("data/ball")
     assert grid.cells[2].flags["policy.path"] == ExternalPath("a/all")
+    one = Grid(ExperimentConfig(tasks=("ball",), train=training))
+    one.plays("ball")
+    assert names(one.cells) == ["play-ball-default-s0"]
+    assert one.cells[0].flags["policy.path"] == ExternalPath("a/all")
 
 
 def test_without_seeds_an_experiment_has_its_own() -> None:

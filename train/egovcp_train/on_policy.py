@@ -250,13 +250,13 @@ def _divergence_reported(learner: OnPolicyLearner, output: Path) -> Iterator[Non
     try:
         yield
     except (RuntimeError, ValueError) as error:  # of sampling from a normal distribution
+        if learner.is_finite:
+            raise
         failure = error
-    if not learner.is_finite:
+    if failure or not learner.is_finite:
         last = output / "checkpoints" / "last"
         kept = f"the last checkpoint is {last.resolve()}" if last.exists() else "none was saved"
         raise DataError(
             f"PPO diverged in iteration {number}: a weight is not finite; {kept}; train again with "
             "a lower --ppo.learning_rate"
         ) from failure
-    if failure is not None:
-        raise failure

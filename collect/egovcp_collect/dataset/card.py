@@ -11,13 +11,14 @@ from typing import Any, Final
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
+from egovcp.data.destination import require_outside
 from egovcp.data.provenance import source_provenances
 from egovcp.data.source import hub_cache
 from egovcp.errors import UsageError
 from egovcp.files import user_path, write_text
 from egovcp.help_text import field_docs
 from egovcp.hub import is_repo_id
-from egovcp.outputs import output_file, require_no_input, require_output_file, require_writable
+from egovcp.outputs import output_file, require_output_file, require_writable
 from egovcp.sim.config import BaseEnvConfig, EnvConfig
 from egovcp.sim.tasks.registry import describe_task
 from egovcp.terminal import echo
@@ -61,7 +62,7 @@ def run_card(config: CardConfig) -> None:
     output = user_path(config.output) if config.output else reader.root / CARD
     assets = ASSETS if output.name == CARD else f"{ASSETS}/{output.stem}"
     require_output_file(str(output), "--output")
-    require_no_input(str(output), "--output", reader.root / "data", reader.root / "meta")
+    require_outside(reader.root, str(output), "--output")
     require_writable(output.parent / assets)
     statistics, paths = _statistics(reader), list[Path]()
     if statistics is not None:

@@ -11,9 +11,10 @@ from typing import Any
 from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
+from egovcp.data.destination import require_outside
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
-from egovcp.outputs import output_file, require_no_input, write_report
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, one_line
 from egovcp_collect.progress import progress_bar
 
@@ -47,7 +48,7 @@ def run_check(config: CheckConfig) -> None:
     root = local_root(config.dataset)
     if not (config.dataset.root and root.is_dir()):  # `locate` would stop at the first problem
         root = locate(config.dataset).root
-    require_no_input(config.json, "--json", root / "data", root / "meta")
+    require_outside(root, config.json)
     with progress_bar() as progress:
         notes: list[str] = []
         found = list(islice(dataset_problems(root, progress, notes), config.max_problems + 1))

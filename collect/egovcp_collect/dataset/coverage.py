@@ -10,13 +10,14 @@ import numpy as np
 
 from egovcp.checks.lerobot_episode import Statistics, describe, nonfinite_problem
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
+from egovcp.data.destination import require_outside
 from egovcp.data.features import values_of
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
-from egovcp.outputs import output_file, require_no_input, require_writable, write_report
+from egovcp.outputs import output_file, require_writable, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.statistics import (
@@ -97,7 +98,7 @@ def run_coverage(config: CoverageConfig) -> None:
         require_writable(folder)
     source = locate(config.dataset)
     root = source.root
-    require_no_input(config.json, "--json", root / "data", root / "meta")
+    require_outside(root, config.json)
     reader = DatasetReader.open_source(source) if is_own(root) else None
     if reader is None or not reader.robot.is_g1:
         if config.output_dir:

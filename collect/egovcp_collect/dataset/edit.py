@@ -15,11 +15,12 @@ from tqdm import tqdm
 from egovcp.bounds import bounded
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
+from egovcp.data.destination import require_outside
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate, select_episodes
 from egovcp.errors import UsageError
 from egovcp.files import removed_on_error
-from egovcp.outputs import output_file, require_no_input, write_report
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.rewrite import new_folder
 from egovcp_collect.dataset.subset import write_subset
@@ -63,7 +64,7 @@ class SplitConfig:
 def run_delete(config: DeleteConfig) -> None:
     """Write the new dataset."""
     reader, count = _open(config.dataset)
-    require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
+    require_outside(reader.root, config.json)
     if not config.episodes:
         raise UsageError("--episodes is missing; name the episodes to leave out, '[3, 7]'")
     left_out = select_episodes(config.episodes, count, "--episodes").tolist()
@@ -79,7 +80,7 @@ def run_delete(config: DeleteConfig) -> None:
 def run_split(config: SplitConfig) -> None:
     """Write the new datasets."""
     reader, count = _open(config.dataset)
-    require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
+    require_outside(reader.root, config.json)
     total = sum(config.splits.values())
     valid_names = all(re.fullmatch(r"\w[\w.-]{0,99}", name, re.ASCII) for name in config.splits)
     valid_shares = all(0 < share <= 1 for share in config.splits.values())

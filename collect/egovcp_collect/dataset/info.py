@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
+from egovcp.data.destination import require_outside
 from egovcp.data.index import in_split
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.provenance import source_provenances
 from egovcp.data.source import Source, locate
-from egovcp.outputs import output_file, require_no_input, write_report
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo_lines
 
 
@@ -32,7 +33,7 @@ class DatasetInfoConfig:
 def run_info(config: DatasetInfoConfig) -> None:
     """Print the information."""
     source = locate(config.dataset)
-    require_no_input(config.json, "--json", source.root / "data", source.root / "meta")
+    require_outside(source.root, config.json)
     if is_own(source.root):
         info = describe(DatasetReader.open_source(source))
     else:

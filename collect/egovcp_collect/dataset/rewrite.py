@@ -18,7 +18,7 @@ from tqdm import tqdm
 from egovcp.checks.dataset import command_problems
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, metadata, schema
-from egovcp.data.destination import require_new, resolve_root
+from egovcp.data.destination import require_new, require_outside, resolve_root
 from egovcp.data.lerobot import LeRobotReader, episode_runs, is_own
 from egovcp.data.parquet import (
     EPISODE_FEATURES,
@@ -34,7 +34,7 @@ from egovcp.data.source import Source, local_root, require_folder
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
-from egovcp.outputs import output_file, require_no_input, write_report
+from egovcp.outputs import output_file, write_report
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.terminal import echo, echo_lines, one_line
 from egovcp_collect.dataset.check import problem_as_json
@@ -104,7 +104,7 @@ def run_merge(config: MergeConfig) -> None:
     readers = [DatasetReader.open(dataset) for dataset in datasets]
     output = new_folder(config.output_dir, [reader.root for reader in readers])
     for reader in readers:
-        require_no_input(config.json, "--json", reader.root / "data", reader.root / "meta")
+        require_outside(reader.root, config.json)
     require_one_controller({reader.root: reader.controller_id for reader in readers})
     chosen, dropped = _distinct_episodes(readers, config.duplicates)
     roots = [str(reader.root) for reader in readers]
@@ -183,7 +183,7 @@ def run_repair(config: RepairConfig) -> None:
     root = local_root(config.dataset)
     require_folder(root)
     output = new_folder(config.output_dir, [root])
-    require_no_input(config.json, "--json", root / "data", root / "meta")
+    require_outside(root, config.json)
     given = config.records.split(",") if isinstance(config.records, str) else config.records
     originals = [user_path(name).absolute() for name in given if name]
     if not is_own(root) and not originals:

@@ -17,7 +17,7 @@ from egovcp.files import user_path
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.log.tick import MODES
-from egovcp.outputs import STDOUT, output_file, require_no_input, write_report
+from egovcp.outputs import STDOUT, output_file, require_not_input, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
 from egovcp.terminal import echo, echo_lines
@@ -153,7 +153,7 @@ def run(config: RecordingInfoConfig) -> None:
         raise UsageError("no recording given; usage: egovcp-mcap info FILE")
     path = user_path(config.file)
     if config.json != STDOUT:
-        require_no_input(config.json, "--json", path)
+        require_not_input(config.json, "--json", path)
     report, reader = summarise(path)
     if config.json == STDOUT:
         echo(json.dumps(report, indent=2))

@@ -88,7 +88,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **references}
         if ppo:
             offline = None  # unknown for a given policy
-            if grid.trained_on not in config.train.policies:
+            if not grid.given_policy(grid.trained_on):
                 offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
             curves = [results.Curve("PPO", ppo, "C1", "x--")]
             if planner is not None and offline is not None:

@@ -80,7 +80,7 @@ def _model(grid: Grid, part: float) -> Model:
     other experiments, unless the user gave a policy or a dataset."""
     config, tasks = grid.config, grid.config.tasks
     numbers = {task: grid.episodes(task, part) for task in tasks}
-    given = grid.trained_on in config.train.policies or set(tasks) & set(config.data.roots)
+    given = grid.given_policy(grid.trained_on) or set(tasks) & set(config.data.roots)
     whole = all(
         n == grid.episodes(t) == grid.episodes(t, grid.collected) for t, n in numbers.items()
     )

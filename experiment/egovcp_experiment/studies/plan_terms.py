@@ -8,16 +8,15 @@ The candidates are plans of N steps in all three, their costs too. If the mean i
 errors of its terms average out, it is better than each of them. Predicted failures do not count.
 
 Spread: standard deviation of each term over random plans from one state, root mean square over
-states. Plans part as they go on, so later terms tell them apart more clearly, whatever their
-errors.
+states. The plans diverge with each step, so later terms differ more between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -31,9 +30,12 @@ from egovcp.plan.objective import PlanValue
 from egovcp.plan.search import random_walk, target_deltas
 from egovcp_experiment.studies import study
 
-type Term = Literal["mean", "first", "last"]
-
-TERMS: Final[tuple[Term, ...]] = ("mean", "first", "last")
+#: Name -> V (...) from the values (..., N) of the steps of a plan.
+TERMS: Final[Mapping[str, Callable[[Tensor], Tensor]]] = {
+    "mean": lambda values: values.mean(-1),
+    "first": lambda values: values[..., 0],
+    "last": lambda values: values[..., -1],
+}
 _PLANS: Final = 64  # random plans of a state
 _EVERY: Final = 5  # ticks between the states of the spread
 
@@ -57,16 +59,14 @@ class TermEvaluator(NamedTuple):
     """A `PlanEvaluator` of one term, or of their mean."""
 
     model: WorldModel
-    term: Term
+    term: str
 
     def at(self, carry: Carry) -> PlanValue:
         """See `PlanEvaluator`."""
 
         def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             values = term_values(self.model, carry, actions)
-            return {"mean": values.mean(-1), "first": values[..., 0], "last": values[..., -1]}[
-                self.term
-            ]
+            return TERMS[self.term](values)
 
         return plan_value
 
@@ -74,7 +74,7 @@ class TermEvaluator(NamedTuple):
 class TermPolicy(Policy):
     """The policy of an artifact whose planner maximises one term."""
 
-    def __init__(self, artifact: Artifact, term: Term, num_envs: int, seed: int) -> None:
+    def __init__(self, artifact: Artifact, term: str, num_envs: int, seed: int) -> None:
         super().__init__(artifact.world_model, artifact.planner, num_envs, seed)
         self._term = term
 
@@ -101,6 +101,7 @@ def measure(config: PlanTermsConfig) -> None:
     variances: list[Tensor] = []
 
     def collect(step: study.PlayedStep) -> None:
+        """Add the variances of all terms, in the states of all three planners."""
         rows = [row for row in step.live if step.tick[row] % _EVERY == 0]
         if rows:
             carry = step.carry.map(lambda x: x[rows])
@@ -108,16 +109,11 @@ def measure(config: PlanTermsConfig) -> None:
             plans = _random_plans(artifact, sent, generator)
             variances.append(term_values(artifact.world_model, carry, plans).var(1))
 
-    figures = {
-        "mean": _play(artifact, config, "mean", collect),
-        "first": _play(artifact, config, "first"),
-        "last": _play(artifact, config, "last"),
-    }
     config.write(
         {
             "task": config.task,
             "horizon": artifact.planner.horizon,
-            "terms": figures,
+            "terms": {term: _play(artifact, config, term, collect) for term in TERMS},
             "return_std": float(artifact.world_model.return_std),
             "spread": torch.cat(variances).mean(0).sqrt().tolist(),
         }
@@ -127,8 +123,8 @@ def measure(config: PlanTermsConfig) -> None:
 def _play(
     artifact: Artifact,
     config: PlanTermsConfig,
-    term: Term,
-    look: Callable[[study.PlayedStep], None] = lambda step: None,
+    term: str,
+    look: Callable[[study.PlayedStep], None],
 ) -> dict[str, Any]:
     """Reward, steps and success of each episode; ``look`` sees every step."""
     reward, steps = np.zeros(config.episodes), np.zeros(config.episodes, np.int64)
