@@ -1,4 +1,4 @@
-"""Every fault, many times, against the fake G1 over ZMQ, on loaded cores.
+"""Injects every fault many times into the fake G1 over ZMQ, on loaded cores; prints reaction times.
 
 Prints a row per kind; docs/robot.md summarises them. Fails (exit code 1) if a reaction is not the
 required one, or if the 99th percentile of the time to DAMP of any kind with a DAMP deadline is

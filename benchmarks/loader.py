@@ -84,7 +84,7 @@ def windows_per_second(batches: Iterator[object], seconds: float) -> float:
 def compare(
     index: EpisodeIndex, length: int, rounds: int, shuffle: ShuffleConfig
 ) -> dict[str, object]:
-    """Rates, and the ratios of both streams to LeRobot."""
+    """Rates, and the ratios of both samplers to LeRobot."""
     config = SamplerConfig(batch_size=BATCH, length=length)
     (reader,) = index.readers
     cases: dict[str, Callable[[], Iterator[object]]] = {
@@ -172,9 +172,11 @@ def main() -> None:
     options.add_argument(
         "--episodes", type=int, default=100, help="episodes of the synthetic dataset"
     )
-    options.add_argument("--length", type=int, default=32, help="rows of a window")
+    options.add_argument("--length", type=int, default=32, help="steps per window")
     options.add_argument("--shuffle_episodes", type=int, default=128, help="episodes in memory")
-    options.add_argument("--reuse", type=float, default=1.0, help="mean uses of a row in memory")
+    options.add_argument(
+        "--reuse", type=float, default=1.0, help="mean number of times a step in memory is sampled"
+    )
     options.add_argument(
         "--hub_episodes",
         type=int,

@@ -85,7 +85,7 @@ def run_skill(
             verdict = watches[i].update(reading, command)
             seconds += 1.0 / CONTROLLER_HZ
             if reason := verdict.damp or verdict.hold:
-                if dropped and tick >= _DROPPED_TICK:
+                if dropped and tick >= _DROPPED_TICK and JOINT_NAMES[_KNEE] in reason:
                     detection_times.append((tick - _DROPPED_TICK) / CONTROLLER_HZ)
                 else:
                     false_alarms.append(f"{skill.name} {tick / CONTROLLER_HZ:.2f} s: {reason}")

@@ -54,7 +54,8 @@ MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1
 
 def dry_run(config: DeployConfig) -> None:
     """Perform all checks of a run on a robot, also after one has failed; print each result, then
-    go. A missing real-time priority is only a warning. Raises the first error, if any."""
+    go. A missing real-time priority and an unusual mode are only warnings. Raises the first error,
+    if any."""
     errors: list[EgovcpError] = []
 
     def perform[T](
@@ -98,14 +99,16 @@ def dry_run(config: DeployConfig) -> None:
         now = time.monotonic_ns()
         if robot is not None and (reading := measured.reading) is not None:
             states = robot.arrivals.stats(now, LISTEN_S)
-            mode = f"mode machine {reading.mode}: 29 joints, waist free"
-            perform("mode", lambda: robot.warning or mode)
-            perform("joints", lambda: joint_offsets(reading.joint_position))
+            if robot.warning:
+                echo(f"warn   mode: {robot.warning}")
+            else:
+                echo(f"go     mode: mode machine {reading.mode}: 29 joints, waist free")
+            perform("joints", lambda: check_joint_positions(reading.joint_position))
             perform("posture", lambda: check_posture(reading))
-            perform("motors", lambda: motors(measured))
+            perform("motors", lambda: check_motors(measured))
             gap_ms = limits.state_hold_s * 1e3
             perform("states", lambda: check_message_rate(states, STATE_HZ, gap_ms))
-            perform("other publishers", lambda: refused(robot.refusal) or "none detected")
+            perform("arming", lambda: check_arming(robot.refusal))
         if camera is not None:
             images, image_gap_ms = camera.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
             perform("images", lambda: check_message_rate(images, IMAGE_HZ, image_gap_ms))
@@ -117,11 +120,16 @@ def dry_run(config: DeployConfig) -> None:
     echo("go")
 
 
-def refused(reason: str) -> str:
-    """Raise `EnvironmentFailure` with ``reason`` unless it is empty."""
-    if reason:
-        raise EnvironmentFailure(reason)
-    return reason
+def require_no_problem(problem: str) -> None:
+    """Raise `EnvironmentFailure` unless the text is empty."""
+    if problem:
+        raise EnvironmentFailure(problem)
+
+
+def check_arming(refusal: str) -> str:
+    """Whether the robot can be armed: no other program commands it, and its mode is the same."""
+    require_no_problem(refusal)
+    return "no other publisher, same mode"
 
 
 # --- this machine and the policy -------------------------------------------------------------
@@ -201,7 +209,7 @@ def measure(robot: BridgeRobot | None, camera: AnyCamera | None, seconds: float)
     return measured
 
 
-def joint_offsets(position: Array) -> str:
+def check_joint_positions(position: Array) -> str:
     """Largest offset of the joints (29,) rad from the neutral pose; too far from it to stand up, or
     outside the joint's range, is a no-go."""
     outside = np.maximum(JOINT_LOWER - position, position - JOINT_UPPER)
@@ -219,7 +227,7 @@ def joint_offsets(position: Array) -> str:
             f"{finding}, expected at most {MAX_OFFSET:g}; move it by hand to about "
             f"{neutral[i]:+.2f} rad"
         )
-    return f"the farthest, {finding}"
+    return f"largest offset: {finding}"
 
 
 def check_posture(reading: LowState) -> str:
@@ -234,9 +242,9 @@ def check_posture(reading: LowState) -> str:
     return f"IMU {tilt:.2f} rad from upright, pelvis {height:.2f} m above the lower foot"
 
 
-def motors(measured: Measurements) -> str:
+def check_motors(measured: Measurements) -> str:
     """The hottest motor, and the checks that are off."""
-    refused(measured.refusal)
+    require_no_problem(measured.refusal)
     readings = None if measured.reading is None else measured.reading.motors
     joint = "" if readings is None else hottest(readings)
     finding = f"the hottest is {joint}" if joint else "no temperatures are reported"

@@ -126,7 +126,7 @@ class EvalConfig:
         return tuple(dict.fromkeys(names))
 
     def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
+        """Raise `UsageError` for invalid or contradictory options."""
         for task in self.tasks:
             if "oracle" in self.controller_names and not find_task(task).has_oracle():
                 raise UsageError(f"task {task} has no oracle; leave it out of --controllers")
@@ -190,10 +190,11 @@ def evaluate(config: EvalConfig) -> None:
             if received:
                 raise KeyboardInterrupt
     finally:
+        incomplete = _incomplete(config, scores)
         if played := _sorted_scores(scores):
             record = {
                 "backend": backend,
-                "complete": not _missing(config, scores),
+                "complete": not incomplete,
                 "config": encoded(config, "policy.path", "constant.path", "ppo.path", "output_dir"),
                 "artifact": artifact.manifest if artifact else None,
                 "ppo": dict(ppo.provenance) if ppo else None,
@@ -217,8 +218,8 @@ def evaluate(config: EvalConfig) -> None:
             every = chain(*(chain(*by_controller.values()) for by_controller in played.values()))
             if skipped := sum(score.skipped for score in every):
                 echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
-            if missing := _missing(config, scores):
-                echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
+            if incomplete:
+                echo(f"INCOMPLETE: {', '.join(incomplete)} episodes played")
             echo(f"metrics: {folder / 'eval.json'}")
 
 
@@ -235,12 +236,11 @@ def _sorted_scores(scores: Scores) -> Scores:
     return {task: by_controller for task, by_controller in found.items() if by_controller}
 
 
-def _missing(config: EvalConfig, scores: Scores) -> list[str]:
-    """``[ball hold 0 of 80, ...]``: what each controller has played, if episodes are missing."""
+def _incomplete(config: EvalConfig, scores: Scores) -> list[str]:
+    """``[ball hold 0 of 80, ...]``: the controllers whose episodes are not complete."""
     counts = {f"{task} {name}": len(scores[task][name]) for task in scores for name in scores[task]}
-    if min(counts.values()) == config.episodes:
-        return []
-    return [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
+    total = config.episodes
+    return [f"{name} {count} of {total}" for name, count in counts.items() if count < total]
 
 
 def _find_constants(
@@ -249,6 +249,9 @@ def _find_constants(
     """Task -> best constant action, searched unless ``known``."""
     found = {}
     for task in config.tasks:
+        if task in known:
+            found[task] = known[task]
+            continue
         with tqdm(unit="ep", desc=f"{task}: best constant action") as bar:
 
             def play(
@@ -268,7 +271,7 @@ def _find_constants(
                     raise KeyboardInterrupt
                 return [list(each) for each in batched(scores, len(scenarios))]
 
-            found[task] = known.get(task) or search_constant(task, config.seed, play)
+            found[task] = search_constant(task, config.seed, play)
     return found
 
 

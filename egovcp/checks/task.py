@@ -42,8 +42,8 @@ def check_task(
 
     Seeds must reproduce episodes bit for bit, also after other episodes and in another row. States
     and rewards must be finite, and reward terms at most ``MAX_REWARD`` in size. An episode ends by
-    a fall or the time limit, never by success. `check_env` checks the first 10 ticks only, and
-    `check_robot` the robot, if it is not the G1.
+    a fall or the time limit, never by success. `check_env` checks the first 10 ticks only. A robot
+    other than the G1 is checked by `check_robot`.
 
     Args:
         task: name of an installed task, or ``package.module:Class``.

@@ -43,7 +43,7 @@ def frame_layout(robot: RobotSpec) -> Mapping[str, FrameLayout]:
     }
 
 
-#: That of the G1.
+#: Frame layout of the G1.
 FRAME_LAYOUT: Final = frame_layout(G1)
 _OPTIONAL: Final = ("reward_terms", "object")
 _NOT_GIVEN: Final = np.empty((0, 0), np.float32)

@@ -47,7 +47,7 @@ VALUES = [
 COMMON_KINDS = (float, int, bool, tuple[float, float])
 #: Integers that allocate nothing.
 UNBOUNDED = {
-    *("seed", "seeds", "steps", "compared_steps", "warmup_steps", "attempts"),
+    *("seed", "seeds", "steps", "warmup_steps", "attempts"),
     *("log_freq", "eval_freq", "save_freq", "decode_every", "multistep_stride", "stride"),
     *("episode", "max_problems", "most", "mode"),
 }

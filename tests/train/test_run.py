@@ -58,6 +58,8 @@ def test_a_run_writes_checkpoints_and_an_artifact_that_plans(
     assert artifact.manifest["step"] == 6
     assert {"latent/active", "latent/kl"} <= artifact.manifest["heldout"].keys()
     assert artifact.manifest["heldout_tasks"]["ball"]["episodes"] == 1
+    earlier = load_artifact(str(output / "checkpoints" / "000003" / "pretrained_model"))
+    assert earlier.manifest["heldout"] == {}, "it was not evaluated"
     printed = capsys.readouterr().out
     assert "done at step 6" in printed
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
@@ -71,7 +73,7 @@ def test_a_gpu_that_cannot_record_steps_is_said_once(
 ) -> None:
     monkeypatch.setattr(Learner, "capture_error", "operation not permitted")
     assert main(arguments(tmp_path / "run", log_freq=1)) == 0
-    said = re.findall("cannot be recorded as a CUDA graph .*", capsys.readouterr().out)
+    said = re.findall("could not be captured as a CUDA graph .*", capsys.readouterr().out)
     assert len(said) == 1
     assert "operation not permitted" in said[0]
 

@@ -1,4 +1,4 @@
-"""egovcp-train on a dataset of the Hub, streamed: pinned, resumable, honest about a network."""
+"""Training streamed from the Hub: pinned commit, resume, network errors."""
 
 import shutil
 from pathlib import Path
@@ -69,7 +69,7 @@ def streamed(arguments: Arguments, commit: str) -> Arguments:
 
 
 @pytest.fixture
-def nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_prefetch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files come only when they are read, so that which ones are here depends on no timing."""
     monkeypatch.setattr("egovcp.hub.file_cache.PREFETCH_FILES", 0)
 
@@ -82,8 +82,8 @@ def _artifact(output: Path) -> Any:
     return load_artifact(str(output / "checkpoints" / "last" / "pretrained_model"))
 
 
-@pytest.mark.usefixtures("nothing_ahead")
-def test_a_run_starts_before_the_dataset_is_here_and_stays_with_its_commit(
+@pytest.mark.usefixtures("no_prefetch")
+def test_training_starts_before_the_download_ends_and_keeps_its_commit(
     streamed: Arguments, many_files: Path, commit: str, tmp_path: Path
 ) -> None:
     assert main(streamed(tmp_path / "run", steps=1)) == 0
@@ -113,7 +113,7 @@ def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("nothing_ahead")
+@pytest.mark.usefixtures("no_prefetch")
 def test_a_lost_network_ends_the_run_and_a_resumed_one_goes_on_with_the_next_batch(
     streamed: Arguments,
     hub: FakeHub,
@@ -148,7 +148,7 @@ def test_a_lost_network_ends_the_run_and_a_resumed_one_goes_on_with_the_next_bat
     ("repo_id", "status", "code", "message"),
     [("me/none", 0, 3, "no dataset me/none"), ("me/ball", 403, 5, "read access")],
 )
-def test_what_cannot_be_read_is_refused_before_anything_is_written(
+def test_an_unreadable_dataset_is_refused_before_output_is_written(
     streamed: Arguments,
     hub: FakeHub,
     tmp_path: Path,
@@ -165,7 +165,7 @@ def test_what_cannot_be_read_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_damage_that_is_met_under_way_ends_the_run(
+def test_a_damaged_file_found_during_training_ends_the_run(
     streamed: Arguments, many_files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An episode of the Hub is validated when it is first read."""

@@ -72,9 +72,9 @@ EPILOG = (
     "edit it, and give --config_path."
 )
 _FIT_SHARE: Final = 0.25  # part of --max_minutes that the fit of the critic takes at most
-_UNRECORDED = (
-    f"{PROG}: steps are correct but many times slower than possible on this GPU, because they "
-    "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
+_NOT_CAPTURED = (
+    f"{PROG}: the training step could not be captured as a CUDA graph ({{reason}}), so it runs "
+    "many times slower; results are correct; --device=cpu may be as fast; please report this"
 )
 
 
@@ -101,8 +101,10 @@ def train(config: TrainConfig) -> None:
 
     Raises:
         KeyboardInterrupt: a signal ended it early; after the first step, the checkpoint is written.
-        UsageError: a launcher has started several processes.
-        EnvironmentFailure: the memory of the device does not suffice.
+        UsageError: an option is invalid, or a launcher has started several processes.
+        DataError: a dataset is damaged or has changed, or the loss or a weight is not finite.
+        ArtifactError: the policy to start from, or the checkpoint to resume, cannot be read.
+        EnvironmentFailure: too little memory, or Hub, W&B or the planner's backend cannot be used.
     """
     _require_one_process()
     device = choose_device(config.device)
@@ -116,7 +118,8 @@ def train(config: TrainConfig) -> None:
     with reporting_full_memory(), ExitStack() as stack:
         previous = signal.signal(signal.SIGTERM, raise_interrupt)
         stack.callback(signal.signal, signal.SIGTERM, previous)
-        is_converted, config = bool(config.features), convert_if_needed(config)
+        is_converted = bool(config.features)
+        config = convert_if_needed(config)
         with removed_on_error(Path(config.dataset.root)) if is_converted else nullcontext():
             run = _prepare_run(config, output, device, bf16)
         run.execute()
@@ -137,22 +140,22 @@ def _prepare_run(
     if initial:
         model.load_state_dict(initial)
     learner = Learner(model.to(device), config.optimizer, config.seed, bf16, config.planner)
-    if config.resume:
-        spent, fit_seconds = _restore(output, learner, data)
-    else:
-        fitting = Budget(config.critic_fit.updates, _FIT_SHARE * config.max_minutes)
-        learner.critic = privileged_value.prepare(learner.model, data, fitting.progress, bf16)
-        spent = fit_seconds = fitting.spent
-    budget = Budget(config.steps, config.max_minutes, spent=spent, fit_seconds=fit_seconds)
     provenance = _provenance(data)
-    simulation = None
+    closed_loop = None
     if config.eval_closed_loop:
         make_evaluator(model, config.planner)  # refuses a backend that cannot be used here
         tasks, controller = provenance["tasks"], provenance["controller_id"]
-        simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
+        closed_loop = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
+    if config.resume:
+        spent_s, fit_s = _restore(output, learner, data)
+    else:
+        fit_budget = Budget(config.critic_fit.updates, _FIT_SHARE * config.max_minutes)
+        learner.critic = privileged_value.prepare(learner.model, data, fit_budget.progress, bf16)
+        spent_s = fit_s = fit_budget.spent
+    budget = Budget(config.steps, config.max_minutes, spent=spent_s, fit_seconds=fit_s)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    return TrainingRun(config, output, learner, data, device, provenance, budget, simulation)
+    return TrainingRun(config, output, learner, data, device, provenance, budget, closed_loop)
 
 
 def _require_one_process() -> None:
@@ -177,30 +180,35 @@ class TrainingRun:
         device: torch.device,
         provenance: dict[str, Any],
         budget: Budget,
-        simulation: ClosedLoop | None = None,
+        closed_loop: ClosedLoop | None = None,
     ) -> None:
         self.config, self.output, self.learner, self.data = config, output, learner, data
-        self.device, self.provenance, self.simulation = device, provenance, simulation
+        self.device, self.provenance, self.closed_loop = device, provenance, closed_loop
         self.budget = budget
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
-        self.played: dict[str, float] = {}
+        self.closed_loop_metrics: dict[str, float] = {}
+        self.evaluated_step = -1
         self.loggers = make_loggers(config, output)
 
     def execute(self) -> None:
-        """Train until the budget or a signal ends it; the last state is always saved.
+        """Train until the budget is spent or a signal comes, then evaluate and save. After an error
+        the last periodic checkpoint remains.
 
         Raises:
             KeyboardInterrupt: a signal has ended it.
         """
         learner = self.learner
         start = learner.step
-        with stop_on_signal() as stopped:
-            finished = self._learn(stopped)
-            final = checkpoint_dir(self.output, learner.step)
-            if learner.step > start or not final.exists():
-                self.finish()
-        self._conclude(final, finished)
+        with ExitStack() as stack:
+            for logger in self.loggers:
+                stack.callback(logger.close)
+            with stop_on_signal() as stopped:
+                finished = self._learn(stopped)
+                final = checkpoint_dir(self.output, learner.step)
+                if learner.step > start or not final.exists():
+                    self.finish()
+            self._conclude(final, finished)
         if not finished:
             raise KeyboardInterrupt
 
@@ -209,10 +217,9 @@ class TrainingRun:
         artifact = final / "pretrained_model"
         echo(self._final_message(artifact, stopped=not finished))
         write_card(artifact, self.output, self.config.policy.repo_id)
-        for logger in self.loggers:
-            if finished:
+        if finished:
+            for logger in self.loggers:
                 logger.log_policy(self.learner.step, artifact)
-            logger.close()
         if finished and self.config.policy.push_to_hub:
             publish_trained(artifact, self.config.policy)
 
@@ -230,7 +237,7 @@ class TrainingRun:
                 if progress >= 1.0 or stopped:
                     return progress >= 1.0
                 if learner.step > start:
-                    self._pause()
+                    self._evaluate_and_save_if_due()
                 batch = to_tensors(next(self.data.stream), self.device)
                 terms = learner.update(batch, progress)
                 bar.update()
@@ -239,10 +246,10 @@ class TrainingRun:
                     bar.set_postfix(self._summary(terms, bar, frames))
                     if learner.capture_error and not warned:
                         warned = True
-                        bar.write(one_line(_UNRECORDED.format(reason=learner.capture_error)))
+                        bar.write(one_line(_NOT_CAPTURED.format(reason=learner.capture_error)))
 
-    def _pause(self) -> None:
-        """Measure, save and record what is due between two steps."""
+    def _evaluate_and_save_if_due(self) -> None:
+        """Evaluate, save and log what is due between two steps."""
         config, learner, report = self.config, self.learner, None
         if config.eval_freq and learner.step % config.eval_freq == 0:
             report = self.measure()
@@ -264,15 +271,16 @@ class TrainingRun:
         model, critic = self.learner.averaged, self.learner.critic
         report = measure(model, episodes, critic=critic.value if critic else None)
         self.metrics, self.tasks = report.metrics, report.tasks
-        if self.simulation is not None:
-            self.played = self.simulation.play(model, self.config.planner)
+        if self.closed_loop is not None:
+            self.closed_loop_metrics = self.closed_loop.play(model, self.config.planner)
+        self.evaluated_step = self.learner.step
         return report
 
     def show(self, report: HeldoutReport) -> None:
         """Record the last measurements and their pictures."""
         heldout = self.metrics | scalars(self.tasks)
-        found = {f"heldout/{k}": v for k, v in heldout.items()}
-        self._log(found | {f"closed_loop/{k}": v for k, v in self.played.items()})
+        metrics = {f"heldout/{k}": v for k, v in heldout.items()}
+        self._log(metrics | {f"closed_loop/{k}": v for k, v in self.closed_loop_metrics.items()})
         pictures = draw(report) if self.loggers else {}
         for logger in self.loggers:
             for name, picture in pictures.items():
@@ -289,8 +297,14 @@ class TrainingRun:
             DataError: the model is not finite.
         """
         self.learner.require_finite()
-        found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
-        provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
+        metrics: dict[str, Any] = {"heldout": {}, "heldout_tasks": {}, "closed_loop": {}}
+        if self.evaluated_step == self.learner.step:
+            metrics = {
+                "heldout": self.metrics,
+                "heldout_tasks": self.tasks,
+                "closed_loop": self.closed_loop_metrics,
+            }
+        provenance = self.provenance | {"step": self.learner.step, **finite_or_null(metrics)}
         state = {
             "learner": self.learner.state_dict(),
             "stream": self.data.stream.state_dict(),
@@ -311,14 +325,20 @@ class TrainingRun:
         return summary
 
     def _final_message(self, artifact: Path, stopped: bool) -> str:
-        found = self.metrics | {f"closed_loop/{k}": v for k, v in self.played.items()}
-        lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(found.items())]
         state = "stopped early" if stopped else "done"
+        lines = [f"{PROG}: {state} at step {self.learner.step}"]
+        for title, metrics in (
+            ("held-out episodes:", self.metrics),
+            ("simulation:", self.closed_loop_metrics),
+        ):
+            if metrics:
+                values = [f"  {name:<20} {value:.4f}" for name, value in sorted(metrics.items())]
+                lines += [title, *values]
+        if self.tasks:
+            lines.append(table(self.tasks))
         return "\n".join(
             [
-                f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
                 *lines,
-                table(self.tasks),
                 f"artifact: {artifact}",
                 f"continue: {PROG} --output_dir={self.output} --resume"
                 if stopped

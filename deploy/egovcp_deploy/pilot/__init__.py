@@ -1,1 +1,1 @@
-"""Between the planner and the robot: states, watchdogs, late plans, and what may be sent."""
+"""Supervision between planner and robot: state machine, watchdogs, late plans, command limits."""

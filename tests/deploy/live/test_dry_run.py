@@ -15,7 +15,12 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
-from egovcp_deploy.dry_run import check_message_rate, check_posture, image_age, joint_offsets
+from egovcp_deploy.dry_run import (
+    check_joint_positions,
+    check_message_rate,
+    check_posture,
+    image_age,
+)
 from egovcp_deploy.robots.base import LowState
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.subscriber import ArrivalStats
@@ -38,16 +43,16 @@ def pitched(angle: float) -> LowState:
 
 
 def test_the_joint_farthest_from_neutral_is_named() -> None:
-    assert "+0.00 rad from neutral" in joint_offsets(NEUTRAL)
-    words = joint_offsets(moved(KNEE, -0.5))
-    assert words == "the farthest, left_knee_joint is -0.50 rad from neutral"
+    assert "+0.00 rad from neutral" in check_joint_positions(NEUTRAL)
+    words = check_joint_positions(moved(KNEE, -0.5))
+    assert words == "largest offset: left_knee_joint is -0.50 rad from neutral"
 
 
 def test_a_joint_far_from_neutral_or_outside_its_range_is_a_no_go() -> None:
     with pytest.raises(EnvironmentFailure, match=r"left_knee_joint is \+1.80 rad from neutral"):
-        joint_offsets(moved(KNEE, 1.8))
+        check_joint_positions(moved(KNEE, 1.8))
     with pytest.raises(EnvironmentFailure, match=r"left_knee_joint reports .* calibrate its zero"):
-        joint_offsets(moved(KNEE, -1.2))
+        check_joint_positions(moved(KNEE, -1.2))
 
 
 def test_the_posture_has_tilt_and_height() -> None:
@@ -144,7 +149,7 @@ def test_a_healthy_robot_is_go_in_every_line(look: Look) -> None:
             fake.step()
 
     _, lines = look(settle)
-    checks = ["mode", "joints", "posture", "motors", "states", "other publishers"]
+    checks = ["mode", "joints", "posture", "motors", "states", "arming"]
     checks += ["controller", "robot", "camera", "images", "image age"]
     assert [lines[name] for name in checks if not lines[name].startswith("go")] == []
     assert "mode machine 5: 29 joints, waist free" in lines["mode"]
@@ -194,7 +199,12 @@ def test_a_robot_with_a_locked_waist_is_a_no_go(look: Look) -> None:
     assert lines["image age"].startswith("go"), "the camera is looked at all the same"
 
 
+def test_an_unusual_mode_is_a_warning(look: Look) -> None:
+    _, lines = look(lambda fake: fake.faults.apply("mode 7"))
+    assert lines["mode"].startswith("warn   mode: mode machine 7 is not known")
+
+
 def test_another_program_that_commands_is_a_no_go(look: Look) -> None:
     code, lines = look(lambda fake: fake.faults.apply("other_publisher"))
     assert code == 5
-    assert lines["other publishers"].startswith("NO-GO")
+    assert lines["arming"].startswith("NO-GO")

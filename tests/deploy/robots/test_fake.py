@@ -245,6 +245,7 @@ def test_console_commands_set_and_clear_faults() -> None:
     "line",
     [
         *("frieze_state", "drop", "drop much", "push hard", "push 1", "drop nan", "mode 300"),
+        "mode 6.5",
         *("freeze_camera of", "clear all", "release now", "dropped_motor left_knee 3"),
         *("hot_motor left_knee 110 120", "hot_motor left_knee nan", "push nan 0", "push inf 0"),
     ],

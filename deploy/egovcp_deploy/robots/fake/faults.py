@@ -29,8 +29,8 @@ class InjectedFaults:
     other_publisher: bool = False  # another program holds every joint where it is
     mode: int | None = None  # report this value of Unitree's `mode_machine` field
     hot_motor: tuple[int, float] | None = None
-    """Joint whose motor's winding has this temperature, deg C. Detailed states report it; others
-    report its mean with the casing's 35 deg C."""
+    """Index of a joint, and the temperature of its motor's winding, deg C. Detailed states report
+    it; others report its mean with the casing's 35 deg C."""
     dropped_motor: int | None = None  # joint without torque; only detailed states report it
     push: tuple[float, ...] | None = None  # change of the base's velocity, m/s, world x, y; once
     release: bool = False  # the gantry releases the robot, once
@@ -64,7 +64,10 @@ class InjectedFaults:
         elif word == "drop":
             self.drop = _numbers(rest, "drop 0.5", 1, high=1.0)[0]
         elif word == "mode":
-            self.mode = int(_numbers(rest, "mode 6", 1, high=255.0)[0])
+            (value,) = _numbers(rest, "mode 6", 1, high=255.0)
+            if not value.is_integer():
+                raise UsageError(f"mode {value:g}: expected a whole number, such as mode 6")
+            self.mode = int(value)
         else:
             setattr(self, word, True)
         return f"faults: {', '.join(self.active) or 'none'}"
