@@ -26,6 +26,7 @@ DISTRIBUTIONS: Final = MappingProxyType(
         "rerun": "rerun-sdk",
         "rsl_rl": "rsl-rl-lib",
         "sklearn": "scikit-learn",
+        "yaml": "pyyaml",
         "zmq": "pyzmq",
     }
 )
