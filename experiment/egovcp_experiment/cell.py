@@ -87,6 +87,8 @@ class CellCommand:
     """Estimate of the time that it takes with these flags, min, on two cores of an x86 CPU."""
     resume_flags: Callable[[Path], Flags | None] = lambda folder: None
     """Flags that resume an interrupted run in the folder; None: start again."""
+    options: str = ""
+    """``module:name`` of the dataclass of its options; empty: users give it no flags."""
     packages: tuple[str, ...] = ()
     """Optional modules that it imports."""
     exclusive: bool = False
@@ -210,6 +212,7 @@ COLLECT: Final = CellCommand(
     figures=_collect_figures,
     digest=lambda folder: sha256(folder / HASHES_PATH),
     minutes=lambda flags: 0.0012 * float(flags["episodes"]),
+    options="egovcp_collect.config:CollectConfig",
     resume_flags=lambda folder: {"resume": True},  # staged episodes are beside the folder
 )
 TRAIN: Final = CellCommand(
@@ -219,6 +222,7 @@ TRAIN: Final = CellCommand(
     figures=_train_figures,
     digest=lambda folder: _artifact_digest(folder / ARTIFACT),
     minutes=lambda flags: 0.0095 * float(flags["steps"]),
+    options="egovcp_train.config:TrainConfig",
     resume_flags=_resume_from_checkpoint,
 )
 TRAIN_PPO: Final = CellCommand(
@@ -228,6 +232,7 @@ TRAIN_PPO: Final = CellCommand(
     figures=_ppo_figures,
     digest=_ppo_digest,
     minutes=lambda flags: 3e-5 * float(flags["steps"]),
+    options="egovcp_train.ppo.train:PpoTrainConfig",
     resume_flags=_resume_from_checkpoint,
     packages=("rsl_rl", "tensordict"),
 )
@@ -238,6 +243,7 @@ PLAY: Final = CellCommand(
     figures=_eval_figures,
     digest=lambda folder: sha256(folder / "eval_run.json"),
     minutes=_play_minutes,
+    options="egovcp_deploy.evaluate:EvalConfig",
 )
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from importlib import import_module
 from typing import Final
 
 import draccus
 
 from egovcp.artifact import load_artifact
-from egovcp.cli import preset_defaults
+from egovcp.cli import parse_config, preset_defaults
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError
 from egovcp.files import user_path
@@ -19,6 +20,7 @@ from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
+from egovcp_experiment.cell import COLLECT, PLAY, TRAIN, TRAIN_PPO, CellCommand
 from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report import publish
@@ -46,8 +48,10 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
     with store.locked():
         scheduler = CellScheduler(cells, store, config.jobs, echo)
         records = scheduler.records
-        for command in dict.fromkeys(c.command for c in cells if c.name not in records):
+        commands = dict.fromkeys(c.command for c in cells if c.name not in records)
+        for command in commands:
             require_packages("egovcp-train", command.prog, *command.packages)
+        require_flags(config, commands)
         echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete; {scheduler.outlook}")
         try:
             scheduler.run()
@@ -89,13 +93,34 @@ def require_given(config: ExperimentConfig) -> None:
                 load_artifact(path)
 
 
+def require_flags(config: ExperimentConfig, commands: Collection[CellCommand]) -> None:
+    """Refuse unusable flags for the commands of cells before any cell runs.
+
+    Raises:
+        UsageError: a flag is unknown, or its value is invalid.
+    """
+    for option, command, flags in (
+        ("scenes", COLLECT, config.scenes),
+        ("data.flags", COLLECT, config.data.flags),
+        ("train.flags", TRAIN, config.train.flags),
+        ("play.flags", PLAY, config.play.flags),
+        ("ppo.flags", TRAIN_PPO, config.ppo.flags),
+    ):
+        if flags and command in commands:
+            module, _, name = command.options.partition(":")
+            argv = [f"--{command.output}=FOLDER", *flags]
+            with _naming(f"--{option}"):
+                parse_config(getattr(import_module(module), name), argv, command.prog)
+
+
 @contextmanager
 def _naming(option: str) -> Iterator[None]:
     """Prefix errors with the option."""
     try:
         yield
     except EgovcpError as error:
-        raise type(error)(f"{option}: {error}") from error
+        error.args = (f"{option}: {error}",)
+        raise
 
 
 COMMANDS: Final = CommandGroup(
