@@ -143,21 +143,22 @@ def make_plan[C](
 def action_costs(
     start: Tensor, actions: Tensor, config: PlannerConfig, discount: Tensor | float
 ) -> Tensor:
-    """Discounted costs (E, M) of poses and action changes in plans (E, M, config.actions, 7), of
-    which the first N count, from a_{t-1} (E, 1, 7):
+    """Discounted costs (E, M) of poses and action changes in plans (E, M, P, 7) of P steps from
+    a_{t-1} (E, 1, 7):
 
     sum_{k<K} gamma^k (pose_cost mean(a_k^2) + action_rate_cost mean((a_k - a_{k-1})^2) / limit^2)
 
-    gamma is ``discount``, K the horizon N. Under ``objective=value`` K is `spec.RETURN_STEPS` if
-    that is more, because Q also counts later rewards: after the plan the last action is held.
+    gamma is ``discount``. K is P under ``objective=reward``. The other objectives contain Q, which
+    also counts later rewards: K is `spec.RETURN_STEPS` if that is more, and after the plan the last
+    action is held.
     """
-    actions = actions[..., : config.horizon, :]
     before = torch.cat([start[:, None].expand_as(actions[..., :1, :]), actions[..., :-1, :]], -2)
     change = (actions - before) / spec.ACTION_RATE_LIMIT
     pose = config.pose_cost * actions.square().mean(-1)
-    steps = max(config.horizon, spec.RETURN_STEPS if config.objective == "value" else 0)
-    weight = discount ** torch.arange(steps, device=actions.device)
-    during, after = weight[: config.horizon], weight[config.horizon :].sum()
+    steps = actions.shape[-2]
+    counted = max(steps, 0 if config.objective == "reward" else spec.RETURN_STEPS)
+    weight = discount ** torch.arange(counted, device=actions.device)
+    during, after = weight[:steps], weight[steps:].sum()
     rate = config.action_rate_cost * change.square().mean(-1)
     return ((pose + rate) * during).sum(-1) + pose[..., -1] * after
 

@@ -120,8 +120,8 @@ def test_value_of_a_plan_is_the_objective_less_the_discounted_action_costs(
 
     def cost(before: np.ndarray, actions: np.ndarray) -> float:
         total = 0.0
-        for k in range(16 if objective == "value" else 4):
-            action = actions[min(k, 3)]  # the last one is held
+        for k in range(4 if objective == "reward" else 16):
+            action = actions[min(k, len(actions) - 1)]  # the last one is held
             change = (action - before) / spec.ACTION_RATE_LIMIT
             total += spec.GAMMA**k * float(3.0 * np.mean(action**2) + 2.0 * np.mean(change**2))
             before = action
