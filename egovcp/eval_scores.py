@@ -18,7 +18,7 @@ _RESAMPLES: Final = 4000
 _TRIALS: Final = 10  # as in the paper
 
 
-def wilson(successes: int, trials: int) -> Interval:
+def wilson(successes: float, trials: int) -> Interval:
     """Wilson's score interval of a rate, at 95 %; valid also at 0 and 1.
 
     (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
@@ -46,6 +46,15 @@ def bootstrap(
     return float(low), float(high)
 
 
+def _paired_interval(differences: Array) -> Interval:
+    """95 % interval of the mean of paired differences of successes, in [-1, 1], with one more pair
+    of either sign (Agresti and Min, 2005): not of zero width where all pairs are equal."""
+    count, total = len(differences) + 2, float(differences.sum())
+    square = float(np.square(differences).sum()) + 1 - total**2 / count
+    half = Z95 * math.sqrt(square) / count
+    return max(-1.0, total / count - half), min(1.0, total / count + half)
+
+
 def points_range(interval: Sequence[float]) -> str:
     """An interval of differences of rates, percentage points, as ``-3.0 to +8.5``."""
     return f"{100 * interval[0]:+.1f} to {100 * interval[1]:+.1f}"
@@ -70,21 +79,16 @@ class Gain(NamedTuple):
         low, high = self.reward_interval
         return better if low > 0 else worse if high < 0 else same
 
-    def columns(self) -> tuple[str, ...]:
+    def columns(self) -> tuple[str, str]:
         """Success, percentage points, and reward per step, each with its interval."""
         return (
-            f"{100 * self.success:+.1f}",
-            points_range(self.success_interval),
-            f"{self.reward:+.5f}",
-            signed_range(self.reward_interval),
+            f"{100 * self.success:+.1f} ({points_range(self.success_interval)})",
+            f"{self.reward:+.5f} ({signed_range(self.reward_interval)})",
         )
 
     def __str__(self) -> str:
-        success, success_range, reward, reward_range = self.columns()
-        return (
-            f"reward per step {reward}, 95 % {reward_range}; success {success} points, "
-            f"{success_range}"
-        )
+        success, reward = self.columns()
+        return f"reward per step {reward}, success {success} points"
 
 
 @dataclass(frozen=True)
@@ -114,10 +118,8 @@ class EvalScores:
 
     @property
     def success_interval(self) -> Interval:
-        """95 %: Wilson for one seed, bootstrap over scenarios for several."""
-        if len(self.success) == 1:
-            return wilson(int(self.success.sum()), self.success.size)
-        return bootstrap(lambda i: _mean(self.success, i), self.success.shape[1])
+        """95 %, Wilson; a scenario is one trial, however many trainings have played it."""
+        return wilson(float(self.success.mean(0).sum()), self.success.shape[1])
 
     @property
     def reward_per_step(self) -> float:
@@ -161,7 +163,7 @@ class EvalScores:
             self.reward_per_step - other.reward_per_step,
             bootstrap(lambda i: self._reward_per_step(i) - other._reward_per_step(i), len(success)),
             float(success.mean()),
-            bootstrap(lambda i: success[i].mean(1), len(success)),
+            _paired_interval(success),
         )
 
     def figures(self) -> dict[str, Any]:

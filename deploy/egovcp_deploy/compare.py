@@ -26,16 +26,8 @@ _EPILOG: Final = (
     "same. With one run, compare two of its controllers: --other_controller=hold."
 )
 _HEAD: Final = (
-    "task",
-    "episodes",
-    "success",
-    "other",
-    "difference, pp",
-    "95 %",
-    "reward/step",
-    "other",
-    "difference",
-    "95 %",
+    *("task", "episodes", "success", "other", "difference, points (95 %)"),
+    *("reward/step", "other", "difference (95 %)"),
 )
 
 
@@ -110,7 +102,7 @@ def compare(config: CompareConfig) -> None:
         if not a:
             raise UsageError(f"no scenario of {task} was played by both")
         ours, theirs = eval_scores(a), eval_scores(b)
-        success, success_range, reward, reward_range = ours.gain(theirs).columns()
+        success, reward = ours.gain(theirs).columns()
         lines.append(
             (
                 task,
@@ -118,11 +110,9 @@ def compare(config: CompareConfig) -> None:
                 f"{ours.success_rate:.1%}",
                 f"{theirs.success_rate:.1%}",
                 success,
-                success_range,
                 f"{ours.reward_per_step:+.5f}",
                 f"{theirs.reward_per_step:+.5f}",
                 reward,
-                reward_range,
             )
         )
     echo(f"{config.controller} of {run.folder} compared with {other_controller} of {other.folder}")

@@ -121,6 +121,7 @@ def play_group(
     success: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
     terminated: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
     parts: tuple[dict[str, bool], ...] = ({},) * num_envs
+    terms: dict[str, NDArray[np.float64]] = {}
     sinks = [PictureSink(*video_paths(stem)) for stem in videos]
     for sink in sinks:
         sink.open(RunInfo("", robot=env.robot))
@@ -137,6 +138,8 @@ def play_group(
         result = env.step(sent)
         policy.advance(result.sent_action)
         rewards += np.where(live, result.reward, 0.0)
+        for name, values in result.reward_terms.items():
+            terms[name] = terms.get(name, 0.0) + np.where(live, values, 0.0)
         steps += live
         success, terminated, parts = result.success, result.terminated, result.parts
         observation = result.observation
@@ -151,6 +154,7 @@ def play_group(
             success=bool(success[i]),
             terminated=bool(terminated[i]),
             parts=parts[i],
+            terms={name: float(values[i]) for name, values in terms.items()},
             skipped=int(skipped[i]),
             plan_ms=plan_ms[: int(steps[i])],
         )

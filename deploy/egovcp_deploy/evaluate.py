@@ -307,5 +307,5 @@ def _run_episodes(
 
 
 def _score_json(score: EpisodeScore) -> dict[str, Any]:
-    omitted = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
-    return {name: value for name, value in asdict(score).items() if name not in omitted}
+    empty = {name for name in ("parts", "terms") if not getattr(score, name)}
+    return {k: v for k, v in asdict(score).items() if k not in empty | {"plan_ms"}}

@@ -29,6 +29,7 @@ class EpisodeScore:
     plan_ms: list[float] = field(default_factory=list)  # per step; of robots together: per robot
     skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
     parts: dict[str, bool] = field(default_factory=dict)  # success of each part of a sequence
+    terms: dict[str, float] = field(default_factory=dict)  # reward term -> sum over the episode
 
 
 def paired(

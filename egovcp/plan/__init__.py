@@ -5,7 +5,7 @@ from egovcp.plan.objective import PlanEvaluator, ReferenceEvaluator
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.policy import Policy, PolicyStep, blank_observation
 from egovcp.plan.search import Optimiser, Plan, make_plan, time_left_until
-from egovcp.plan.value_map import HandGrid, hand_grid, value_map
+from egovcp.plan.value_map import HandGrid, hand_grid, held_value, value_map
 
 __all__ = [
     "HandGrid",
@@ -18,6 +18,7 @@ __all__ = [
     "ReferenceEvaluator",
     "blank_observation",
     "hand_grid",
+    "held_value",
     "make_plan",
     "optimiser_of",
     "require_affordable",

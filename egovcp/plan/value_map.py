@@ -1,20 +1,25 @@
-"""Q of the planned action with one hand moved over its x-z plane (fig. 7a).
+"""Value of the planned action with one hand moved over its x-z plane (fig. 7a).
 
     V(z, x) = Q(h_t, z_t, a with its hand at (x, z))
 
-with a the planned action, everything else of it held.
+with a the planned action, everything else of it held; optionally minus the cost of holding it. Q
+was fitted to actions that the rate limit allows after the last one, and does not contain the known
+costs of poses and action changes.
 """
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple
+from dataclasses import replace
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Dynamics
+from egovcp.plan.search import action_costs
 from egovcp.spec import ACTION_BOX
 
 #: Where x, y and z of each hand are in an action.
@@ -45,16 +50,32 @@ def value_map[L](
     action: Tensor,
     hand: Literal["left", "right"],
     grid: HandGrid,
+    planner: PlannerConfig | None = None,
 ) -> Tensor:
-    """Q (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units."""
+    """Values (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units:
+    Q, or of a ``planner`` `held_value`."""
     axis_x, _, axis_z = HAND_AXES[hand]
     x = _normalised(grid.x, axis_x, action)
     z = _normalised(grid.z, axis_z, action)
     actions = action[:, None, None, :].repeat(1, len(z), len(x), 1)  # (E, n, m, 7)
     actions[..., axis_x] = x
     actions[..., axis_z] = z[:, None]
-    values = model.value(model.expand_candidates(carry), actions.flatten(1, 2))
+    moved = actions.flatten(1, 2)
+    if planner is None:
+        values = model.value(model.expand_candidates(carry), moved)
+    else:
+        values = held_value(model, carry, moved, planner)
     return values.reshape(len(action), len(z), len(x))
+
+
+@torch.no_grad()
+def held_value[L](model: Dynamics[L], carry: L, actions: Tensor, planner: PlannerConfig) -> Tensor:
+    """J (E, M) of actions (E, M, 7), return units: Q minus the planner's cost of holding that pose,
+    without the cost of changing to it."""
+    known: Any = model  # its discount is no part of `Dynamics`
+    held = replace(planner, action_rate_cost=0.0)
+    costs = action_costs(actions[:, 0, None], actions[..., None, :], held, known.discount)
+    return model.value(model.expand_candidates(carry), actions) - costs
 
 
 def _normalised(metric: NDArray[np.float32], axis: int, like: Tensor) -> Tensor:

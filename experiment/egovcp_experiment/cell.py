@@ -29,7 +29,7 @@ RESULT: Final = "result.json"
 #: includes its search.
 _EPISODE_MINUTES: Final = {"hold": 0.003, "random": 0.003, "oracle": 0.003, "constant": 0.03}
 #: Minutes of an episode of a study that simulates many variations of it.
-_STUDY_MINUTES: Final = {"residuals": 0.15, "plan_terms": 0.1}
+_STUDY_MINUTES: Final = {"residuals": 0.15, "plan_terms": 0.035}
 
 type Flags = Mapping[str, Any]
 """Name of a flag without dashes -> text, number, bool, list or mapping; references at any depth."""
@@ -190,9 +190,10 @@ def _eval_figures(folder: Path) -> dict[str, Any]:
 def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
     names = ("episode", "steps", "reward", "success")
     columns: dict[str, Any] = {name: [episode[name] for episode in episodes] for name in names}
-    if "parts" in episodes[0]:
-        parts = episodes[0]["parts"]
-        columns["parts"] = {part: [e["parts"][part] for e in episodes] for part in parts}
+    for name in ("parts", "terms"):
+        if name in episodes[0]:
+            keys = episodes[0][name]
+            columns[name] = {key: [episode[name][key] for episode in episodes] for key in keys}
     return columns
 
 

@@ -61,7 +61,7 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
             report = experiment.report(config, complete)
             encoded = draccus.encode(config)
             publish(store.folder, name, report, complete, missing, encoded, shlex.join(argv))
-    for line in report.findings:
+    for line in (*report.lead, *report.findings):
         echo(f"- {line}")
     echo(f"report: {store.folder / name}.html, .md, .json")
 

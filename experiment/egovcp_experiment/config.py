@@ -11,6 +11,8 @@ from egovcp.errors import UsageError, suggest
 
 #: The paper's tasks.
 TASKS: Final = ("ball", "wall", "arch")
+#: So that `table1` can compare the objectives of the planner with one model.
+_REWARD_HEAD: Final = "--policy.loss.reward=1"
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,12 @@ class TrainingConfig:
     policies: dict[str, str] = field(default_factory=dict)
     """Existing policies instead of training the default model, '{all: contact}'; `all` is the model
     of all --tasks, a task that of this task alone. Used for every seed."""
-    flags: tuple[str, ...] = ("--eval_freq=0", "--tensorboard=false")
+    flags: tuple[str, ...] = (
+        "--eval_freq=0",
+        "--tensorboard=false",
+        "--loading.mode=ram",  # auto depends on the free memory, and stream draws other windows
+        _REWARD_HEAD,
+    )
     """Further flags of egovcp-train."""
 
 
@@ -66,7 +73,7 @@ class PlayConfig:
 
     episodes: int = bounded(100, least=1, most=1_000_000)
     """Scenarios of each task; all variants play the same ones."""
-    seed: int = bounded(2, least=0)  # options were tuned on the scenarios of seeds 0, 1 and 3
+    seed: int = bounded(20, least=0)  # options were tuned on the scenarios of seeds 0 to 9
     """Seed of the held-out scenarios."""
     branches: int = bounded(6, least=2, most=10_000)
     """Random-walk rollouts from each plan step; their mean return is what Q is compared with
@@ -81,7 +88,7 @@ class PlayConfig:
 class PpoBaselineConfig:
     """The model-free baseline of ppo and sample-efficiency."""
 
-    steps: int = bounded(200_000, least=0)
+    steps: int = bounded(500_000, least=0)
     """Transitions of a training, rounded to whole updates between policies; 0: no PPO in
     sample-efficiency."""
     policies: int = bounded(4, least=1, most=10_000)
@@ -217,6 +224,7 @@ def smoke() -> ExperimentConfig:
                 "--tensorboard=false",
                 "--device=cpu",
                 "--threads=1",
+                _REWARD_HEAD,
             ),
         ),
         ppo=PpoBaselineConfig(
@@ -248,7 +256,7 @@ def paper() -> ExperimentConfig:
         train=TrainingConfig(
             steps=100_000,
             seeds=(0, 1, 2),
-            flags=("--eval_freq=0",),
+            flags=("--eval_freq=0", _REWARD_HEAD),
         ),
         ppo=PpoBaselineConfig(steps=5_000_000, policies=10),
         play=PlayConfig(episodes=300, branches=12, budget_ms=40.0),

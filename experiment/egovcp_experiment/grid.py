@@ -163,21 +163,27 @@ class Grid:
         return self.add(Cell(name or f"bounds-{task}", PLAY, flags)).name
 
     def study(
-        self, name: str, task: str, flags: Flags, extra: Sequence[str] = (), exclusive: bool = False
+        self,
+        name: str,
+        task: str,
+        flags: Flags,
+        extra: Sequence[str] = (),
+        exclusive: bool = False,
+        model: Model = _DEFAULT_MODEL,
     ) -> str:
-        """Name of the cell STUDY-TASK: a study of the first default model, with the planner flags
-        of egovcp-eval."""
+        """Name of the cell STUDY-TASK: a study of the first training of a model, with the planner
+        flags of egovcp-eval."""
         play = parse_flags(self.config.play.flags)
         planner = {flag: value for flag, value in play.items() if flag.startswith("planner.")}
-        policy = self.model(self.trained_on, self.config.train.seeds[0])
+        policy = self.model(self.trained_on, self.config.train.seeds[0], model)
         cell = name if task == ALL else f"{name}-{task}"
         flags = {**planner, "policy.path": policy, **flags}
         return self.add(Cell(cell, study(name, exclusive), flags, tuple(extra))).name
 
-    def sim_study(self, name: str, task: str, flags: Flags) -> str:
+    def sim_study(self, name: str, task: str, flags: Flags, model: Model = _DEFAULT_MODEL) -> str:
         """Name of the cell of a study in simulation, in the configured scenes."""
         seed = {"seed": self.config.play.seed}
-        return self.study(name, task, {**flags, **seed}, self.config.scenes)
+        return self.study(name, task, {**flags, **seed}, self.config.scenes, model=model)
 
     def scenarios(self, task: str) -> Flags:
         """Flags of egovcp-eval for the scenarios of a task."""

@@ -33,6 +33,23 @@ def versions() -> dict[str, str]:
     return versions_of(("egovcp", "torch", "numpy", "mujoco"))
 
 
+def commit() -> str:
+    """Git commit of this code, with a "+" if files of it have changed; empty if it is installed
+    without a checkout."""
+    folder = Path(__file__).parent
+
+    def git(*args: str) -> str:
+        command = ["git", "-C", str(folder), *args]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    try:
+        known = git("ls-files", Path(__file__).name)  # not so in a virtual environment
+        return git("describe", "--always", "--exclude=*", "--dirty=+") if known else ""
+    except OSError:  # no git
+        return ""
+
+
 @cache
 def machine() -> dict[str, Any]:
     """Hardware of this machine. Opens the GPU, so it is called after a command has ended."""

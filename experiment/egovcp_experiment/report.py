@@ -15,6 +15,11 @@ from egovcp.files import write_json, write_text
 from egovcp_experiment.cell import Record
 
 _SMOKE: Final = "Scale `smoke`: every command ran once. **The metrics mean nothing.**"
+#: Explains the tables and drawings of every page.
+INTERVALS: Final = (
+    "In brackets and bands: 95 % intervals over scenarios. The rows of a table play the same "
+    "scenarios; differences are paired. How trainings differ by their seeds is not included."
+)
 _DIGITS: Final = 12  # of a shortened hash
 _STYLE: Final = """
 body { font: 15px/1.45 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -24,7 +29,7 @@ td { font-variant-numeric: tabular-nums; }
 code { font-size: 12px; overflow-wrap: anywhere; }
 figure { margin: 1em 0; } figcaption { color: #555; font-size: 13px; }
 svg { max-width: 100%; height: auto; }
-.findings { background: #f4f4ee; padding: 0.5em 1.5em; }
+.lead { background: #f4f4ee; padding: 0.5em 1.5em; }
 """
 
 
@@ -57,8 +62,12 @@ class ExperimentReport:
 
     title: str
     """One line."""
+    lead: list[str] = field(default_factory=list)
+    """The sentences that matter, about three; they begin the page."""
+    figure: Plot | None = None
+    """The drawing that matters, next on the page."""
     findings: list[str] = field(default_factory=list)
-    """Conclusions that are derived from the metrics."""
+    """Further conclusions that are derived from the metrics."""
     sections: list[Part] = field(default_factory=list)
     """Paragraphs, tables and drawings."""
     figures: dict[str, Any] = field(default_factory=dict)
@@ -78,6 +87,21 @@ def percent(rate: float | None) -> str:
 def percent_range(interval: Sequence[float]) -> str:
     """An interval of rates as ``80.1 to 92.3 %``."""
     return f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f} %"
+
+
+def listed(parts: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return " and ".join(part for part in (", ".join(parts[:-1]), parts[-1]) if part)
+
+
+def on_tasks(words: Mapping[str, str]) -> str:
+    """Task -> word, as ``better on ball and wall and worse on arch``."""
+    return listed(
+        [
+            f"{word} on {listed([task for task in words if words[task] == word])}"
+            for word in dict.fromkeys(words.values())
+        ]
+    )
 
 
 def draw(
@@ -124,12 +148,13 @@ def publish(
     if missing:
         total = len(records) + len(missing)
         notes.append(f"**Incomplete**: {len(records)} of {total} cells so far.")
-    report = replace(report, findings=[*notes, *report.findings])
+    report = replace(report, lead=[*notes, *report.lead])
     origin = _origin(records, command)
     content = {
         "experiment": name,
         "title": report.title,
-        "shows": report.findings,
+        "lead": report.lead,
+        "findings": report.findings,
         "figures": report.figures,
         "cells": dict(records),
         "missing": list(missing),
@@ -138,7 +163,7 @@ def publish(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / f"{name}.json", content)
-    for part in report.sections:
+    for part in (report.figure, *report.sections):
         if isinstance(part, Plot):
             head = '<?xml version="1.0" encoding="utf-8"?>\n'
             write_text(folder / f"{name}-{part.name}.svg", f"{head}{part.svg}\n")
@@ -168,8 +193,10 @@ def _origin(records: Mapping[str, Record], command: str) -> list[Part]:
         for name, record in records.items()
     ]
     head = ("cell", "minutes", "date", "settings", "result", "command")
+    commits = dict.fromkeys(r["commit"] for r in records.values() if r.get("commit"))
+    code = [*versions, *(f"commit {commit}" for commit in commits)]
     return [
-        f"Made by `{command}` on {'; '.join(machines) or 'nothing yet'} ({'; '.join(versions)}).",
+        f"Made by `{command}` on {'; '.join(machines) or 'nothing yet'} ({'; '.join(code)}).",
         Table("Cells, with the SHA-256 of settings and results", head, rows),
     ]
 
@@ -185,9 +212,12 @@ def _markdown(report: ExperimentReport, origin: Sequence[Part], stem: str) -> st
         rows = "\n".join(f"| {' | '.join(line)} |" for line in cells)
         return f"**{part.title}**\n\n{rows}" if part.title else rows
 
+    lead = " ".join(report.lead)
+    figure = [convert(report.figure)] if report.figure else []
     findings = "\n".join(f"- {line}" for line in report.findings)
     sections = [convert(part) for part in (*report.sections, *origin)]
-    return "\n\n".join([f"# {report.title}", "**What it shows**", findings, *sections]) + "\n"
+    blocks = [f"# {report.title}", lead, *figure, INTERVALS, findings, *sections]
+    return "\n\n".join(block for block in blocks if block) + "\n"
 
 
 def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
@@ -205,11 +235,13 @@ def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
         return f"{title}<table><tr>{head}</tr>\n{rows}</table>"
 
     title = escape(report.title)
+    lead = "".join(f"<p>{_inline(line)}</p>" for line in report.lead)
+    figure = convert(report.figure) if report.figure else ""
     findings = "".join(f"<li>{_inline(line)}</li>" for line in report.findings)
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{title}</title><style>{_STYLE}</style></head><body>\n<h1>{title}</h1>\n"
-        f'<div class="findings"><b>What it shows</b><ul>{findings}</ul></div>\n'
+        f'<div class="lead">{lead}</div>\n{figure}\n<p>{INTERVALS}</p>\n<ul>{findings}</ul>\n'
         + "\n".join(map(convert, report.sections))
         + "\n<details><summary>How each number was made</summary>\n"
         + "\n".join(map(convert, origin))

@@ -57,22 +57,24 @@ def figures_of(scores: Mapping[Any, EvalScores]) -> dict[str, Any]:
 
 def comparison(title: str, scores: Mapping[str, EvalScores], reference: str) -> Table:
     """Success and reward of each, and paired differences to ``reference``."""
-    head = ["", "success", "95 %", "reward/step", "95 %", "sd over seeds"]
+    head = ["", "success", "reward per step"]
+    spreads = any(each.reward_spread is not None for each in scores.values())
+    if spreads:
+        head.append("its sd over trainings")
     base = scores.get(reference)
     if base is not None:
-        head += [f"success - {reference} (points)", "95 %", f"reward - {reference}", "95 %"]
+        head += [f"success above {reference} (points)", f"reward above {reference}"]
     rows = []
     for name, each in scores.items():
         row = [
             name,
-            percent(each.success_rate),
-            percent_range(each.success_interval),
-            f"{each.reward_per_step:+.5f}",
-            signed_range(each.reward_interval),
-            number(each.reward_spread, ".5f"),
+            f"{percent(each.success_rate)} ({percent_range(each.success_interval)})",
+            f"{each.reward_per_step:+.5f} ({signed_range(each.reward_interval)})",
         ]
+        if spreads:
+            row.append(number(each.reward_spread, ".5f"))
         if base is not None:
-            row += [""] * 4 if each is base else each.gain(base).columns()
+            row += [""] * 2 if each is base else each.gain(base).columns()
         rows.append(row)
     return Table(title, head, rows)
 
@@ -167,6 +169,8 @@ HELDOUT: Final[Mapping[str, Callable[[Mapping[str, Any]], float | None]]] = {
     "AUC within 5": lambda task: task["termination"]["5"]["auc"],
     "Q R2": lambda task: task["value"]["r2"],
     "Q slope": lambda task: task["value"]["slope"],
+    "Q ranking": lambda task: task["value"].get("ranking"),
+    "object (m)": lambda task: task.get("object_rmse_m"),
     "z active": lambda task: task["latent"]["active"],
     "KL (nats)": lambda task: task["latent"]["kl_nats"],
 }

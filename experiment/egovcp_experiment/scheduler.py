@@ -12,7 +12,7 @@ from egovcp.entry_point import INTERRUPTED
 from egovcp.errors import EnvironmentFailure
 from egovcp.workers import stop_on_signal
 from egovcp_experiment.cell import Cell
-from egovcp_experiment.local_runner import CellProcess, machine
+from egovcp_experiment.local_runner import CellProcess, commit, machine
 from egovcp_experiment.store import CellStore
 
 _POLL_S: Final = 0.05
@@ -120,7 +120,7 @@ class CellScheduler:
             minutes = process.minutes
             if code == 0:
                 date = datetime.now(UTC).isoformat(timespec="seconds")
-                facts = {"minutes": minutes, "date": date, **machine()}
+                facts = {"minutes": minutes, "date": date, "commit": commit(), **machine()}
                 self._store.save(cell, process.argv, facts)
                 self._progress(cell, f"done in {minutes:.1f} min")
             elif code == INTERRUPTED and self._stopping:

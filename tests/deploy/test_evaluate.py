@@ -95,6 +95,8 @@ def test_all_controllers_play_the_same_scenarios(
         assert row["reward_ci95"][0] <= row["reward_mean"] <= row["reward_ci95"][1]
     for scores in played(out)["ball"].values():
         assert [score["episode"] for score in scores] == [0, 1, 2]
+        for score in scores:
+            assert sum(score["terms"].values()) == pytest.approx(score["reward"])
     assert captured.out.count("ball") >= 5
     assert "eval.json" in captured.out
 

@@ -31,4 +31,4 @@ def test_unknown_variants_and_tasks_are_named() -> None:
 
 @pytest.mark.parametrize("scale", ["small", "paper"])
 def test_results_are_measured_on_scenarios_that_nothing_was_tuned_on(scale: str) -> None:
-    assert SCALES[scale]().play.seed not in (0, 1, 3)
+    assert SCALES[scale]().play.seed not in range(10)

@@ -7,11 +7,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
 
 from egovcp.cli import parse_config, preset_defaults
+from egovcp.files import write_json
 from egovcp_collect.config import PRESETS, CollectConfig
 from egovcp_experiment.cell import (
     ARTIFACT,
@@ -68,15 +70,30 @@ def test_every_cell_comes_after_those_it_needs() -> None:
 def test_all_experiments_share_the_default_evaluation() -> None:
     config = ExperimentConfig(tasks=("ball", "wall"))
     found = {name: {c.name: c for c in e.cells(config)} for name, e in EXPERIMENTS.items()}
-    for name in ("multitask", "planners", "ppo", "sample-efficiency"):
+    for name in ("planners", "ppo", "sample-efficiency"):
         for task in ("ball", "wall"):
             play = f"play-{task}-default-s0"
             assert found[name][play].flags == found["ppo"][play].flags
     play = found["generalise"]["play-ball-default-s0"]
     assert play.flags == found["ppo"][play.name].flags
     assert play.flags["policy.path"] == CellOutput("train-all-default-s0", ARTIFACT)
+    default = found["ppo"]["train-all-default-s0"]
+    assert found["ablations"][default.name] == found["table1"][default.name] == default
     single = found["multitask"]["play-ball-single-s0"].flags
     assert single["policy.path"] == CellOutput("train-ball-default-s0", ARTIFACT)
+
+
+def test_models_of_one_and_of_all_tasks_learn_for_equally_many_epochs() -> None:
+    cells = {c.name: c for c in EXPERIMENTS["multitask"].cells(ExperimentConfig())}
+    mixed = cells["train-all-equal_epochs-s0"]
+    assert mixed.flags["steps"] == 3 * cells["train-ball-default-s0"].flags["steps"]
+    policy = CellOutput(mixed.name, ARTIFACT)
+    assert cells["play-ball-mixed-s0"].flags["policy.path"] == policy
+    assert cells["latents"].flags["policy.path"] == policy
+    training = TrainingConfig(policies={"all": "a/all"})
+    given = {c.name: c for c in EXPERIMENTS["multitask"].cells(ExperimentConfig(train=training))}
+    assert given["latents"].flags["policy.path"] == ExternalPath("a/all")
+    assert not [name for name in given if "equal_epochs" in name]
 
 
 def test_existing_data_and_policies_are_used() -> None:
@@ -197,6 +214,19 @@ def _config(cell: Cell) -> type[Any]:
 
 def _option_defaults() -> Any:
     return importlib.import_module("egovcp_train.train").option_defaults
+
+
+def test_quantities_of_episodes_are_kept_as_columns(tmp_path: Path) -> None:
+    episode = {"episode": 0, "steps": 10, "reward": 0.5, "success": True}
+    old = [episode, episode | {"episode": 1}]
+    new = [each | {"terms": {"hit": -0.5, "block": 1.0}} for each in old]
+    episodes = {"ball": {"hold": old, "planner": new}}
+    write_json(tmp_path / "eval_run.json", {"episodes": episodes})
+    write_json(tmp_path / "eval.json", {"ball": {"hold": {}, "planner": {}}})
+    found = PLAY.figures(tmp_path)["ball"]
+    assert found["planner"]["played"]["terms"] == {"hit": [-0.5, -0.5], "block": [1.0, 1.0]}
+    assert found["planner"]["played"]["episode"] == [0, 1]
+    assert "terms" not in found["hold"]["played"]
 
 
 def test_a_flag_without_a_value_is_true() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ RECORD: dict[str, Any] = {
     "hardware_cpu": "a processor",
     "hardware_cores": 2,
     "hardware_gpu": "none",
+    "commit": "1a2b3c4+",
     "figures": {},
 }
 
@@ -26,7 +28,14 @@ RECORD: dict[str, Any] = {
 def _report() -> ExperimentReport:
     plot = draw("curve", "a curve & more", lambda figure: figure.subplots().plot([1, 2]))
     table = Table("rows", ("name", "value"), (("a|b", "`x<1`"),))
-    return ExperimentReport("Title <1>", ["ours is **worse**"], ["text", table, plot], {"x": 1.5})
+    return ExperimentReport(
+        "Title <1>",
+        lead=["Ours is **worse**."],
+        figure=replace(plot, name="main", caption="the figure"),
+        findings=["a detail"],
+        sections=["text", table, plot],
+        figures={"x": 1.5},
+    )
 
 
 def _publish(folder: Path, scale: str = "small", missing: tuple[str, ...] = ()) -> None:
@@ -48,6 +57,7 @@ def test_three_forms_have_the_same_content(tmp_path: Path) -> None:
         assert "egovcp-train --steps=3" in form
         assert "a processor, 2 cores" in form
         assert "b" * 12 in form
+        assert "commit 1a2b3c4+" in form
     assert (tmp_path / "test-curve.svg").read_text().startswith("<?xml")
 
 
@@ -65,6 +75,16 @@ def test_drawings_are_reproducible() -> None:
 
 def test_smoke_and_missing_cells_come_first(tmp_path: Path) -> None:
     _publish(tmp_path, "smoke", ("other",))
-    shows = json.loads((tmp_path / "test.json").read_text())["shows"]
-    assert "mean nothing" in shows[0]
-    assert "1 of 2 cells" in shows[1]
+    lead = json.loads((tmp_path / "test.json").read_text())["lead"]
+    assert "mean nothing" in lead[0]
+    assert "1 of 2 cells" in lead[1]
+
+
+def test_the_sentences_and_the_figure_that_matter_come_before_the_rest(tmp_path: Path) -> None:
+    _publish(tmp_path)
+    for form in ("test.md", "test.html"):
+        text = (tmp_path / form).read_text()
+        parts = ("Ours is", "the figure", "95 % intervals over", "a detail", "name", "egovcp-train")
+        places = [text.index(part) for part in parts]
+        assert places == sorted(places)
+    assert (tmp_path / "test-main.svg").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 import time
@@ -15,7 +16,7 @@ import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp_experiment.cell import COLLECT, Cell, CellFigure, CellOutput, ExternalPath
-from egovcp_experiment.local_runner import CellProcess
+from egovcp_experiment.local_runner import CellProcess, commit
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
 
@@ -202,3 +203,11 @@ def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
         CellStore(tmp_path).locked(),
     ):
         pass
+
+
+def test_the_commit_of_a_checkout_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    root = Path(__file__).parents[2]
+    if (root / ".git").exists():
+        assert re.fullmatch(r"[0-9a-f]{7,40}\+?", commit())
+    monkeypatch.setenv("PATH", "")
+    assert commit() == ""

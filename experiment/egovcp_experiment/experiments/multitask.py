@@ -8,11 +8,19 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.errors import UsageError
-from egovcp.eval_scores import EvalScores, points_range
+from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import ALL, REFERENCES, Grid
-from egovcp_experiment.report import ExperimentReport, Part, Plot, draw, number
+from egovcp_experiment.grid import ALL, REFERENCES, Grid, Model
+from egovcp_experiment.report import (
+    ExperimentReport,
+    Plot,
+    draw,
+    listed,
+    number,
+    on_tasks,
+    percent,
+)
 
 _LATENT_EPISODES: Final = 16  # per task
 _REFERENCES: Final = (*REFERENCES, "constant")
@@ -29,33 +37,41 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         "Multi-task: one model on mixed data against one for each task",
         sections=[_introduction(config)],
     )
-    tables: list[Part] = []
     levels: dict[str, dict[str, float]] = {}
+    both: dict[str, dict[str, EvalScores]] = {}
+    epochs = Model("equal_epochs", {"steps": len(config.tasks) * config.train.steps})
+    mixed = Model() if grid.given_policy(ALL) else epochs
     for task in config.tasks:
         plays = {
             "single": grid.plays(task, "single", trained_on=task),
-            "mixed": grid.plays(task),
+            "mixed": grid.plays(task, "mixed", model=mixed),
         }
         scores = results.all_scores(records, plays, task)
         cell = grid.references(task, f"references-{task}", controllers=_REFERENCES)
         references = results.controller_scores(records, cell, task, _REFERENCES)
         page.figures[task] = results.figures_of({**scores, **references})
         if scores:
-            tables.append(results.comparison(task, {**scores, **references}, "single"))
+            page.sections.append(results.comparison(task, {**scores, **references}, "single"))
         if len(scores) == 2:
-            page.findings.append(_conclusion(task, scores))
+            both[task] = scores
         if {"oracle", "random"} <= references.keys():
             levels[task] = {name: _level(each, references) for name, each in scores.items()}
             page.figures[task]["normalised"] = levels[task]
     if levels:
-        page.sections.append(_levels_plot(levels))
-    page.sections += tables
+        page.figure = _levels_plot(levels)
+    page.lead = _lead(both)
     episodes = min(config.play.episodes, _LATENT_EPISODES)
-    cell = grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
+    flags = {"tasks": list(config.tasks), "episodes": episodes}
+    cell = grid.sim_study("latents", ALL, flags, mixed)
     if cell in records:
         latents = records[cell]["figures"]
         page.sections.append(_maps(latents))
-        page.findings.append(_separation(latents))
+        page.lead.append(_separation(latents))
+        ticks = [number(latents[name]["tick_r2"], ".2f") for name in ("h", "z")]
+        page.findings.append(
+            f"The nearest states explain {ticks[0]} (h) and {ticks[1]} (z) of the variance of time "
+            "within a task."
+        )
         page.figures["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }
@@ -65,10 +81,11 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
 def _introduction(config: ExperimentConfig) -> str:
     given = [task for task in (*config.tasks, ALL) if task in config.train.policies]
     existing = f" except those given for {', '.join(given)} (`--train.policies`)" if given else ""
+    steps = config.train.steps
     return (
-        f"Every model{existing} was trained for {config.train.steps} gradient steps: the one on "
-        f"mixed data learns {len(config.tasks)} tasks in the steps that a single-task model has "
-        "for one. Its input does not name the task."
+        f"Every model{existing} was trained for equally many epochs, as in the paper: {steps} "
+        f"gradient steps on one task, {len(config.tasks) * steps} on the mixed data of "
+        f"{len(config.tasks)} tasks. Its input does not name the task."
     )
 
 
@@ -78,16 +95,21 @@ def _level(scores: EvalScores, references: Mapping[str, EvalScores]) -> float:
     return (scores.reward_per_step - low) / (high - low) if high != low else float("nan")
 
 
-def _conclusion(task: str, scores: Mapping[str, EvalScores]) -> str:
-    single, mixed = scores["single"], scores["mixed"]
-    gain = mixed.gain(single)
-    low, high = gain.success_interval
-    word = "better" if low > 0 else "worse" if high < 0 else "no different beyond chance"
-    return (
-        f"{task}: mixed {mixed.success_rate:.1%}, single {single.success_rate:.1%} success; mixed "
-        f"is {word} ({100 * gain.success:+.1f} points, 95 % "
-        f"{points_range(gain.success_interval)})"
-    )
+def _lead(scores: Mapping[str, Mapping[str, EvalScores]]) -> list[str]:
+    """Success of both models, and how they compare by reward."""
+    if not scores:
+        return []
+    gains = {task: row["mixed"].gain(row["single"]) for task, row in scores.items()}
+    rates = [
+        f"{percent(row['mixed'].success_rate)} of {task} (its own model "
+        f"{percent(row['single'].success_rate)})"
+        for task, row in scores.items()
+    ]
+    words = {t: gain.word(same="no different beyond chance") for t, gain in gains.items()}
+    return [
+        f"One model of all tasks succeeds in {listed(rates)}.",
+        f"By reward, it is {on_tasks(words)}.",
+    ]
 
 
 def _levels_plot(levels: Mapping[str, Mapping[str, float]]) -> Plot:
@@ -129,8 +151,7 @@ def _maps(latents: Mapping[str, Any]) -> Plot:
 def _separation(latents: Mapping[str, Any]) -> str:
     h, z = latents["h"], latents["z"]
     return (
-        f"the nearest states of other episodes are of the same task in {h['same_task']:.1%} (h) "
-        f"and {z['same_task']:.1%} (z) of cases, by chance in {h['chance']:.1%}; they explain "
-        f"{number(h['tick_r2'], '.2f')} (h) and {number(z['tick_r2'], '.2f')} (z) of the variance "
-        "of time within a task"
+        "The nearest states of other episodes are of the same task in "
+        f"{percent(h['same_task'])} (h) and {percent(z['same_task'])} (z) of cases, by chance in "
+        f"{percent(h['chance'])}."
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from egovcp.eval_scores import EvalScores
+from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
 from egovcp_experiment.cell import CellFigure, Flags
+from egovcp_experiment.gain_plot import Difference, gain_plot
 from egovcp_experiment.grid import Grid
 from egovcp_experiment.report import ExperimentReport, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
@@ -25,6 +26,13 @@ RULES: Final[dict[str, Flags]] = {
 }
 
 
+#: Kind of variants -> the one that the others are compared with.
+_REFERENCE: Final = {"searches": "cem", "rules": "default"}
+
+type Scores = Mapping[str, EvalScores]
+"""Variant -> scores."""
+
+
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     page = ExperimentReport(
@@ -38,6 +46,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ],
     )
     chosen = config.chosen({**dict.fromkeys(SEARCHES), **dict.fromkeys(RULES)})
+    found: dict[str, dict[str, Scores]] = {kind: {} for kind in _REFERENCE}
     for task in config.tasks:
         search_plays = _search_plays(grid, task, [name for name in SEARCHES if name in chosen])
         rule_plays = {
@@ -50,17 +59,54 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             timed = timing["figures"]["searches"]
             page.sections.append(_timings(task, timed, searches))
             page.findings += _over_budget(task, timed, searches, config.play.budget_ms)
-        for kind, scores, reference in (("searches", searches, "cem"), ("rules", rules, "default")):
+        for kind, scores in (("searches", searches), ("rules", rules)):
             if scores:
                 title = f"{task}: {kind}"
-                page.sections += [
-                    results.comparison(title, scores, reference),
-                    results.comparison_plot(f"{task}-{kind}", title, scores, reference),
-                ]
-                page.findings += _conclusions(task, kind, scores, reference)
+                page.sections.append(results.comparison(title, scores, _REFERENCE[kind]))
+                found[kind][task] = scores
         named = {f"search_{name}": each for name, each in searches.items()}
         page.figures[task] = results.figures_of({**named, **rules})
+    gains = {kind: _gains(kind, scores) for kind, scores in found.items()}
+    if any(found["searches"].values()):
+        best = ", ".join(
+            f"`{max(scores, key=lambda name: scores[name].reward_per_step)}` ({task})"
+            for task, scores in found["searches"].items()
+        )
+        page.lead.append(f"In {config.play.budget_ms:g} ms a plan, the most reward has {best}.")
+    page.lead += [_differing(kind, each) for kind, each in gains.items() if each]
+    panels: dict[str, dict[str, Difference]] = {}
+    for each, colour in zip(gains.values(), ("C0", "C1"), strict=True):
+        for task, row in each.items():
+            shown = {n: Difference(g.reward, g.reward_interval, colour) for n, g in row.items()}
+            panels.setdefault(task, {}).update(shown)
+    if panels:
+        caption = "Reward per step above `cem` (searches, blue) and above `default` (rules, orange)"
+        page.figure = gain_plot("gains", caption, panels, "reward per step")
     return page
+
+
+def _gains(kind: str, found: Mapping[str, Scores]) -> dict[str, dict[str, Gain]]:
+    """Task -> variant -> gain over the reference; without tasks that lack it."""
+    reference = _REFERENCE[kind]
+    return {
+        task: {n: each.gain(scores[reference]) for n, each in scores.items() if n != reference}
+        for task, scores in found.items()
+        if reference in scores and len(scores) > 1
+    }
+
+
+def _differing(kind: str, gains: Mapping[str, Mapping[str, Gain]]) -> str:
+    """The variants whose reward differs from that of the reference by more than chance."""
+    words = [
+        f"`{name}` is {word} at {task}"
+        for task, row in gains.items()
+        for name, gain in row.items()
+        if (word := gain.word(same=""))
+    ]
+    return (
+        f"Of the {kind}, compared with `{_REFERENCE[kind]}` by reward (95 % each): "
+        f"{', '.join(words) or 'none differs'}."
+    )
 
 
 def _search_plays(grid: Grid, task: str, searches: Sequence[str]) -> dict[str, list[str]]:
@@ -98,25 +144,4 @@ def _over_budget(
     return [
         f"{task}, searches: above {budget_ms:g} ms even with the fewest candidates: "
         f"{', '.join(slow)}"
-    ]
-
-
-def _conclusions(
-    task: str, kind: str, scores: Mapping[str, EvalScores], reference: str
-) -> list[str]:
-    if reference not in scores or len(scores) < 2:
-        return []
-    base = scores[reference]
-    found = {name: each.gain(base) for name, each in scores.items() if each is not base}
-    different = [
-        f"`{n}` {gain.reward:+.4f}" for n, gain in found.items() if gain.word("+", "-", "")
-    ]
-    if different:
-        return [
-            f"{task}, {kind}: reward per step minus that of `{reference}`, intervals without "
-            f"zero: {', '.join(different)}"
-        ]
-    return [
-        f"{task}, {kind}: none of {len(scores) - 1} differs from `{reference}` "
-        f"({base.success_rate:.0%} success) in reward by more than chance (95 %)"
     ]

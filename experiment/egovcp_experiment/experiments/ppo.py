@@ -15,8 +15,10 @@ from egovcp.sim.config import short_episodes
 from egovcp_experiment import results
 from egovcp_experiment.cell import PLAY, PPO_POLICY, TRAIN_PPO, Cell, CellOutput, ExternalPath
 from egovcp_experiment.grid import REFERENCES, Grid
-from egovcp_experiment.report import ExperimentReport, percent
+from egovcp_experiment.report import ExperimentReport, listed, on_tasks, percent
 
+#: What the planner's model has, and PPO does not.
+LIMITS: Final = "PPO's critic gets no privileged state, and its samples are not mirrored."
 _PLANNER: Final = "planner"
 
 
@@ -74,63 +76,68 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         sections=[
             f"PPO was trained in the simulator for {config.ppo.transitions[-1]} transitions of "
             "each task, with the observation, actions, rewards, delays and noise of the planner, "
-            f"and played as it was after {', '.join(map(str, config.ppo.transitions))}. The "
-            "planner has its model from random data that were collected once. If its curve still "
-            "rises at the end, PPO was stopped too early to be judged."
+            f"and played as it was after {', '.join(map(str, config.ppo.transitions))}. {LIMITS} "
+            "The planner has its model from random data that were collected once. If PPO's curve "
+            "still rises at the end, it was stopped too early to be judged."
         ],
     )
-    for task in config.tasks:
+    curves: list[results.Curve] = []
+    last: dict[str, EvalScores] = {}
+    planners: dict[str, EvalScores] = {}
+    for k, task in enumerate(config.tasks):
         planner = results.eval_scores(records, grid.plays(task), task)
         ppo = ppo_scores(grid, task, records)
         cell = grid.references(task)
         references = results.controller_scores(records, cell, task, REFERENCES)
+        if planner is not None:
+            planners[task] = planner
+        if ppo:
+            last[task] = list(ppo.values())[-1]
+            curves.append(results.Curve(f"{task}, PPO", ppo, f"C{k}", "x--"))
+            page.findings += _conclusions(task, ppo, references)
+            page.figures[task] = {}
+            if not grid.given_policy(grid.trained_on):  # else its transitions are unknown
+                offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
+                page.figures[task]["planner_transitions"] = offline
+                if planner is not None:
+                    curves.append(results.Curve(task, {offline: planner}, f"C{k}", "o"))
         ours = {} if planner is None else {_PLANNER: planner}
         shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **references}
-        if ppo:
-            offline = None  # unknown for a given policy
-            if not grid.given_policy(grid.trained_on):
-                offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
-            curves = [results.Curve("PPO", ppo, "C1", "x--")]
-            if planner is not None and offline is not None:
-                curves.append(results.Curve(_PLANNER, {offline: planner}, "C0", "o"))
-            caption = f"{task}: success and reward against transitions"
-            page.sections.append(results.learning_curves(task, caption, curves))
-            page.findings += _conclusions(task, offline, planner, ppo, references)
-            page.figures[task] = {} if offline is None else {"planner_transitions": offline}
         if shown:
             page.sections.append(results.comparison(task, shown, _PLANNER))
             page.figures.setdefault(task, {}).update(results.figures_of(shown))
+    if curves:
+        caption = "PPO (dashed) and the planner (dots): success and reward against transitions"
+        page.figure = results.learning_curves("transitions", caption, curves)
+    if planners:
+        page.lead.append(f"The planner succeeds in {_rates(planners)}.")
+    if last:
+        after = steps_text(config.ppo.transitions[-1])
+        page.lead.append(f"PPO succeeds in {_rates(last)} after {after}.")
+    both = {task: _word(each, planners[task]) for task, each in last.items() if task in planners}
+    if both:
+        page.lead.append(f"By reward, compared with the planner, PPO is {on_tasks(both)}.")
     return page
 
 
+def _rates(scores: Mapping[str, EvalScores]) -> str:
+    return listed([f"{percent(each.success_rate)} of {task}" for task, each in scores.items()])
+
+
 def _conclusions(
-    task: str,
-    offline: int | None,
-    planner: EvalScores | None,
-    ppo: Mapping[int, EvalScores],
-    references: Mapping[str, EvalScores],
+    task: str, ppo: Mapping[int, EvalScores], references: Mapping[str, EvalScores]
 ) -> list[str]:
-    count, last = list(ppo.items())[-1]
-    lines = []
-    if planner is not None:
-        seen = "" if offline is None else f" from {steps_text(offline)}"
-        lines.append(
-            f"{task}: the planner {percent(planner.success_rate)} success{seen}, PPO "
-            f"{percent(last.success_rate)} after {steps_text(count)}: PPO is "
-            f"{_versus(last, planner)}"
-        )
-    if "hold" in references:
-        versus = _versus(last, references["hold"])
-        lines.append(f"{task}: compared with the neutral pose, PPO is {versus}")
-    if len(ppo) > 1:
-        first = next(iter(ppo.values()))
-        lines.append(
-            f"{task}: compared with its first policy, PPO's last is {_versus(last, first)}"
-        )
-    return lines
+    policies = list(ppo.values())
+    first, last = policies[0], policies[-1]
+    others = {"the neutral pose": references.get("hold"), "its first policy": first}
+    words = [
+        f"{_word(last, other)} compared with {name}"
+        for name, other in others.items()
+        if other is not None and other is not last
+    ]
+    return [f"{task}: by reward, the last policy of PPO is {listed(words)}."] if words else []
 
 
-def _versus(scores: EvalScores, other: EvalScores) -> str:
+def _word(scores: EvalScores, other: EvalScores) -> str:
     """Better or worse by reward, which PPO is trained on."""
-    gain = scores.gain(other)
-    return f"{gain.word(same='no different beyond chance')} ({gain})"
+    return scores.gain(other).word(same="no different beyond chance")

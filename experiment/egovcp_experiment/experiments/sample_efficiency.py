@@ -5,15 +5,23 @@ Models of all tasks are trained equally long on growing first parts of the data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from typing import Final
 
 from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
-from egovcp_experiment.experiments.ppo import ppo_scores, steps_per_episode, steps_text
+from egovcp_experiment.experiments.ppo import (
+    LIMITS,
+    ppo_scores,
+    steps_per_episode,
+    steps_text,
+)
 from egovcp_experiment.grid import REFERENCES, Grid, Model
-from egovcp_experiment.report import ExperimentReport, Part
+from egovcp_experiment.report import ExperimentReport, listed, on_tasks, percent
+
+_PPO: Final = ", PPO"
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
@@ -35,13 +43,12 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         count = len(config.train.seeds)
         introduction += (
             " The model-free baseline (PPO, dashed) learns one task and collects its transitions "
-            f"while it learns; its curve is that of {count} training{'s' * (count > 1)}."
+            f"while it learns; its curve is that of {count} training{'s' * (count > 1)}. {LIMITS}"
         )
     page = ExperimentReport(
         "Sample efficiency: success against the transitions that a model has seen",
         sections=[introduction],
     )
-    tables: list[Part] = []
     curves: list[results.Curve] = []
     ppo_curves: list[results.Curve] = []
     models = {part: _model(grid, part) for part in sorted(config.data.parts)}
@@ -57,21 +64,19 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         colour = f"C{len(curves)}"
         curves.append(results.Curve(task, sizes, colour))
         if ppo:
-            ppo_curves.append(results.Curve(f"{task}, PPO", ppo, colour, "x--"))
+            ppo_curves.append(results.Curve(task + _PPO, ppo, colour, "x--"))
         named = {steps_text(size): each for size, each in sizes.items()}
         shown = {
             **named,
             **{f"PPO, {steps_text(n)}": each for n, each in ppo.items()},
             **results.controller_scores(records, references, task, REFERENCES),
         }
-        tables.append(results.comparison(task, shown, list(named)[-1]))
-        page.findings.append(_conclusion(task, named))
+        page.sections.append(results.comparison(task, shown, list(named)[-1]))
         page.figures[task] = results.figures_of(shown)
     if curves:
         caption = "Success and reward against transitions"
-        plot = results.learning_curves("transitions", caption, curves + ppo_curves)
-        page.sections.append(plot)
-    page.sections += tables
+        page.figure = results.learning_curves("transitions", caption, curves + ppo_curves)
+    page.lead = _lead(curves, ppo_curves)
     return page
 
 
@@ -93,14 +98,26 @@ def _model(grid: Grid, part: float) -> Model:
     return Model(f"part_{part:g}", flags)
 
 
-def _conclusion(task: str, named: Mapping[str, EvalScores]) -> str:
-    names = list(named)
-    first, last = named[names[0]], named[names[-1]]
-    if len(names) < 2:
-        return f"{task}: {last.success_rate:.1%} success from {names[-1]}"
-    gain = last.gain(first)
-    word = gain.word("more data helps", "more data hurts", "no clear difference")
-    return (
-        f"{task}: {first.success_rate:.1%} success from {names[0]}, {last.success_rate:.1%} from "
-        f"{names[-1]}: by reward, {word} ({gain})"
-    )
+def _lead(curves: Sequence[results.Curve], ppo: Sequence[results.Curve]) -> list[str]:
+    ends = {curve.label: list(curve.points.items()) for curve in curves}
+    rates = [
+        f"{' to '.join(map(_rate, dict([points[0], points[-1]]).items()))} on {task}"
+        for task, points in ends.items()
+    ]
+    lines = [f"Success with more data: {listed(rates)}."] if rates else []
+    words = {
+        task: points[-1][1].gain(points[0][1]).word("helps", "hurts", "makes no clear difference")
+        for task, points in ends.items()
+        if len(points) > 1
+    }
+    if words:
+        lines.append(f"By reward, more data {on_tasks(words)}.")
+    reached = [
+        f"{_rate(list(curve.points.items())[-1])} on {curve.label.removesuffix(_PPO)}"
+        for curve in ppo
+    ]
+    return lines + ([f"Success of PPO: {listed(reached)}."] if reached else [])
+
+
+def _rate(point: tuple[int, EvalScores]) -> str:
+    return f"{percent(point[1].success_rate)} ({steps_text(point[0])})"

@@ -6,16 +6,30 @@ scenarios.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import sqrt
 from typing import Any, Final
 
+import numpy as np
+
+from egovcp.artifact import policy_folder, read_options
+from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores, Gain
+from egovcp.hub import is_local_path
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.grid import REFERENCES, Grid, Model
-from egovcp_experiment.report import ExperimentReport, Table, number, percent
+from egovcp_experiment.grid import DEFAULT, REFERENCES, Grid, Model, parse_flags
+from egovcp_experiment.report import (
+    ExperimentReport,
+    Plot,
+    Table,
+    draw,
+    listed,
+    number,
+    percent,
+)
 
 type Scores = dict[str, dict[str, EvalScores]]
 """Task -> row -> scores."""
@@ -30,8 +44,12 @@ class Row:
     """A key of `MODELS`."""
     play: Flags
     """Flags of egovcp-eval."""
-    paper: tuple[float, float, float]
-    """The paper's mean rewards of wall, ball and arch."""
+    paper: tuple[float, float, float] | None = None
+    """The paper's mean rewards of wall, ball and arch; None: the paper has no such row."""
+
+    def paper_reward(self, task: str) -> float | None:
+        """The paper's mean reward on a task."""
+        return None if self.paper is None else self.paper[("wall", "ball", "arch").index(task)]
 
 
 @dataclass(frozen=True)
@@ -57,22 +75,31 @@ class Verdict:
     task: str
     gain: Gain
     """``above`` minus ``below``."""
-    agreeing: int
-    """Trainings in which ``above`` has more reward."""
-    seeds: int
-    """Trainings of both."""
+    differences: tuple[float, ...]
+    """The same difference in reward per step, of each training of both."""
+
+    @property
+    def agreeing(self) -> int:
+        """Trainings in which ``above`` has more reward."""
+        return sum(difference > 0 for difference in self.differences)
 
     @property
     def word(self) -> str:
         """One of `WORDS`, by the interval of the reward."""
-        holds = WORDS[0] if self.agreeing == self.seeds else WORDS[1]
-        return self.gain.word(holds, *WORDS[2:])
+        holds = WORDS[0] if self.agreeing == len(self.differences) else WORDS[1]
+        contradicted = WORDS[2] if self.agreeing == 0 else WORDS[3]
+        return self.gain.word(holds, contradicted, WORDS[4])
 
     @property
-    def text(self) -> str:
-        """The word with its figures."""
-        trainings = "" if self.seeds == 1 else f", in {self.agreeing} of {self.seeds} trainings"
-        return f"{self.task} {self.word} ({self.gain}{trainings})"
+    def over_trainings(self) -> tuple[float, float] | None:
+        """Mean of the differences and half of its 95 % interval by Student's t; None for a single
+        training."""
+        n = len(self.differences)
+        if n < 2:
+            return None
+        quantile = _T975[min(n - 1, len(_T975)) - 1]
+        half = quantile * float(np.std(self.differences, ddof=1)) / sqrt(n)
+        return float(np.mean(self.differences)), half
 
     def figures(self) -> dict[str, Any]:
         """For programs."""
@@ -83,27 +110,45 @@ class Verdict:
             "verdict": self.word,
             "reward_gain": self.gain.reward,
             "reward_gain_ci95": list(self.gain.reward_interval),
+            "reward_gain_of_seeds": list(self.differences),
             "success_gain": self.gain.success,
             "success_gain_ci95": list(self.gain.success_interval),
             "seeds_in_favour": self.agreeing,
-            "seeds": self.seeds,
+            "seeds": len(self.differences),
         }
 
     def row(self) -> tuple[str, ...]:
         """In the table of claims."""
-        k = ("wall", "ball", "arch").index(self.task)
-        paper = ROWS[self.claim.above].paper[k] - ROWS[self.claim.below].paper[k]
-        trainings = f"{self.agreeing} of {self.seeds}"
-        columns = (*self.gain.columns(), trainings, f"{paper:+.4f}")
-        return (self.claim.title, self.task, self.word, *columns)
+        above, below = (
+            ROWS[name].paper_reward(self.task) for name in (self.claim.above, self.claim.below)
+        )
+        paper = None if above is None or below is None else above - below
+        spread = self.over_trainings
+        return (
+            *(self.claim.title, self.task, self.word, *self.gain.columns()),
+            "-" if spread is None else f"{spread[0]:+.5f} ± {spread[1]:.5f}",
+            f"{self.agreeing} of {len(self.differences)}",
+            number(paper, "+.4f"),
+        )
 
 
-WORDS: Final = ("holds", "holds on average only", "contradicted", "undecided")
-#: Model -> flags of egovcp-train. All have a reward head, so that nothing else differs.
+#: 97.5 % quantiles of Student's t for 1 to 9 degrees of freedom; the last serves beyond, too.
+_T975: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+WORDS: Final = (
+    "holds",
+    "holds on average only",
+    "contradicted",
+    "contradicted on average only",
+    "undecided",
+)
+_COLOURS: Final = dict(zip(WORDS, ("C2", "#98c898", "C3", "#e8a0a0", "0.5"), strict=True))
+#: Model -> changed flags of egovcp-train.
 MODELS: Final[dict[str, Flags]] = {
-    "reward": {"policy.loss.reward": 1},
-    "reward_arwm": {"policy.loss.reward": 1, "policy.dynamics": "autoregressive"},
-    "reward_td": {"policy.loss.reward": 1, "policy.loss.q_target": "td"},
+    DEFAULT: {},
+    "arwm": {"policy.dynamics": "autoregressive"},
+    "td": {"policy.loss.q_target": "td"},
+    "mc": {"policy.loss.q_target": "mc"},
+    "no_multistep": {"preset": "no_multistep"},
 }
 #: N -> the paper's rewards of wall, ball and arch.
 _HORIZONS: Final[dict[int, tuple[float, float, float]]] = {
@@ -123,13 +168,15 @@ def _plan(objective: str, horizon: int = 4) -> Flags:
 
 ROWS: Final[dict[str, Row]] = {
     **{
-        f"ours_n{n}": Row(f"ours, N={n}", "reward", _plan("value", n), paper)
+        f"ours_n{n}": Row(f"ours, N={n}", DEFAULT, _plan("value", n), paper)
         for n, paper in _HORIZONS.items()
     },
-    "arwm": Row("ARWM", "reward_arwm", _plan("value"), (0.0609, 0.0039, -0.0018)),
-    "rew_mpc": Row("Rew-MPC", "reward", _plan("reward"), (0.0302, -0.0033, -0.0211)),
-    "td_mpc": Row("TD-MPC, Q as in ours", "reward", _plan("td"), _TD_MPC),
-    "td_mpc_td": Row("TD-MPC, Q by TD", "reward_td", _plan("td"), _TD_MPC),
+    "ours_mc": Row("ours, Q by returns", "mc", _plan("value"), _HORIZONS[4]),
+    "no_multistep": Row("ours, no multi-step losses", "no_multistep", _plan("value")),
+    "arwm": Row("ARWM", "arwm", _plan("value"), (0.0609, 0.0039, -0.0018)),
+    "rew_mpc": Row("Rew-MPC", DEFAULT, _plan("reward"), (0.0302, -0.0033, -0.0211)),
+    "td_mpc": Row("TD-MPC, Q as in ours", DEFAULT, _plan("td"), _TD_MPC),
+    "td_mpc_td": Row("TD-MPC, Q by TD", "td", _plan("td"), _TD_MPC),
 }
 OURS: Final = "ours_n4"
 #: The paper's ordering. It has one row of TD-MPC and does not give the target of its Q.
@@ -142,18 +189,36 @@ CLAIMS: Final = (
     Claim(OURS, "td_mpc_td", ("ball", "arch")),
     Claim("td_mpc_td", OURS, ("wall",)),
 )
-_FIRST: Final = (OURS, "arwm", "td_mpc_td")  # under --most: one row of each model
+_FIRST: Final = (OURS, "arwm", "td_mpc_td")  # under --most
+_ACHIEVED: Final = {
+    "ball": "blocks {} of the balls",
+    "wall": "braces in {} of the pushes",
+    "arch": "passes {} of the arches",
+}
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
+    """Request the cells of all rows; report those in ``records``.
+
+    Raises:
+        UsageError: the model of Rew-MPC and TD-MPC has no reward head.
+    """
     config = grid.config
-    chosen = config.chosen(dict.fromkeys([*_FIRST, *ROWS]))
+    names = [*_FIRST, *ROWS]
+    if config.train.preset != DEFAULT:  # which that of the row would replace
+        names.remove("no_multistep")
+    chosen = config.chosen(dict.fromkeys(names))
+    _require_reward_head(grid, chosen)
     plays = {
         task: {
             name: grid.plays(task, name, row.play, Model(row.model, MODELS[row.model]))
             for name, row in ROWS.items()
             if name in chosen
         }
+        for task in config.tasks
+    }
+    references = {
+        task: results.controller_scores(records, grid.references(task), task, REFERENCES)
         for task in config.tasks
     }
     scores = {
@@ -169,29 +234,49 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     ]
     page = ExperimentReport(
         "Table I: horizons, autoregressive training and other objectives",
-        _conclusions(verdicts, scores),
-        [_introduction(config)],
-        {"claims": [v.figures() for v in verdicts]},
+        _lead(verdicts, scores),
+        _forest(verdicts, references),
+        sections=[_introduction(config)],
+        figures={"claims": [v.figures() for v in verdicts]},
     )
+    if verdicts:
+        page.findings.append(
+            f"Were no two rows any different, about {0.025 * len(verdicts):.1f} of the "
+            f"{len(verdicts)} claims would hold and as many be contradicted by chance."
+        )
     if scores:
         page.sections.append(_summary(scores))
     if verdicts:
         head = (
-            *("the paper's claim", "task", "here", "success (points)", "95 %", "reward/step"),
-            *("95 %", "trainings", "the paper's reward"),
+            *("the paper's claim", "task", "here", "success (points)", "reward per step"),
+            *("reward over trainings (95 %, t)", "trainings", "the paper's reward"),
         )
         title = "Differences, above - below, on the same scenarios"
         page.sections.append(Table(title, head, [verdict.row() for verdict in verdicts]))
-    for task in config.tasks:
-        cell = grid.references(task)
-        if task in scores:
-            references = results.controller_scores(records, cell, task, REFERENCES)
-            titled = {ROWS[name].title: each for name, each in scores[task].items()}
-            ours = ROWS[OURS].title
-            page.sections.append(results.comparison(task, {**titled, **references}, ours))
-            page.sections.append(results.comparison_plot(task, task, titled, ours))
-            page.figures[task] = results.figures_of({**scores[task], **references})
+    for task, rows in scores.items():
+        titled = {ROWS[name].title: each for name, each in rows.items()}
+        shown = {**titled, **references[task]}
+        page.sections.append(results.comparison(task, shown, ROWS[OURS].title))
+        page.sections += _terms(task, plays[task], records)
+        page.figures[task] = results.figures_of({**rows, **references[task]})
     return page
+
+
+def _require_reward_head(grid: Grid, rows: Iterable[str]) -> None:
+    """A policy on the Hub is checked by its cells."""
+    path = grid.given_policy(grid.trained_on)
+    local = bool(path) and is_local_path(path)
+    given = not local or read_options(policy_folder(path))[0].loss.reward > 0
+    weight = parse_flags(grid.config.train.flags).get("policy.loss.reward", "0")
+    trained = weight not in ("0", "0.0")
+    for name in rows:
+        is_given = bool(path) and ROWS[name].model == DEFAULT
+        if ROWS[name].play["planner.objective"] != "value" and not (given if is_given else trained):
+            raise UsageError(
+                f"--train.{'policies' if is_given else 'flags'}: row {name} plans with rewards and "
+                "needs a model trained with --policy.loss.reward=1; give one, or leave such rows "
+                "out with --only"
+            )
 
 
 def judge(
@@ -207,67 +292,90 @@ def judge(
     theirs = results.eval_scores(records, [below for _, below in both], task)
     if ours is None or theirs is None:
         return None
-    return Verdict(
-        claim,
-        task,
-        ours.gain(theirs),
-        agreeing=int((ours.reward_of_seeds > theirs.reward_of_seeds).sum()),
-        seeds=len(both),
-    )
+    differences = tuple((ours.reward_of_seeds - theirs.reward_of_seeds).tolist())
+    return Verdict(claim, task, ours.gain(theirs), differences)
 
 
 def _introduction(config: ExperimentConfig) -> str:
-    seeds = len(config.train.seeds)
-    chance = (
-        "Intervals are over scenarios, for one training of each model: they do not include the "
-        "variation between training seeds."
-        if seeds == 1
-        else f"Intervals are over scenarios, for these {seeds} trainings of each model; the number "
-        "of trainings in which a claim holds is given, too."
-    )
+    alone = " One training decides nothing about others." if len(config.train.seeds) == 1 else ""
     return (
         f"All models were trained for {config.train.steps} gradient steps on the data of all tasks "
-        "with a head for rewards (`--policy.loss.reward=1`), and differ in the flags of their row "
-        "only. Ours, Rew-MPC and TD-MPC with Q as in ours plan with the same model. All rows play "
-        f"the same scenarios. {chance}"
+        "and differ in the flags of their row only; ours, Rew-MPC and TD-MPC with Q as in ours "
+        "plan with the same model. Q by TD is SARSA on the random walk of the data, without the "
+        "critic that Q of ours is fitted to. Two rows are not the paper's, because ARWM differs "
+        "from ours in more than the paper compares: `Q by returns` has the paper's own target, and "
+        f"`no multi-step losses` leaves out what the paper's model does not have.{alone}"
     )
+
+
+def _lead(verdicts: Sequence[Verdict], scores: Scores) -> list[str]:
+    lines = []
+    ours = [
+        _ACHIEVED[task].format(percent(rows[OURS].success_rate))
+        for task, rows in scores.items()
+        if OURS in rows
+    ]
+    if ours:
+        lines.append(f"Ours (N = 4) {listed(ours)}.")
+    if verdicts:
+        lines.append(f"Of the paper's {len(verdicts)} claims {count_verdicts(verdicts)}.")
+    best = [text for task, rows in scores.items() if (text := _best_horizon(task, rows))]
+    if best:
+        lines.append(f"Of the horizons the most reward is earned by {listed(best)}.")
+    return lines
 
 
 def count_verdicts(verdicts: Sequence[Verdict]) -> str:
-    """Number of verdicts of each kind, and how many to expect by chance."""
-    count = len(verdicts)
+    """Number of verdicts of each kind: ``9 hold and 1 is undecided``."""
     words = [verdict.word for verdict in verdicts]
-    kinds = ", ".join(f"{words.count(w)} {w}" for w in WORDS if w in words)
-    return (
-        f"of {count} claims, one for each task: {kinds} (95 % intervals; were no two rows any "
-        f"different, about {0.025 * count:.1f} would hold and as many be contradicted by chance)"
-    )
-
-
-def _conclusions(verdicts: Sequence[Verdict], scores: Scores) -> list[str]:
-    lines = [count_verdicts(verdicts)] if verdicts else []
-    for claim in CLAIMS:
-        own = [verdict.text for verdict in verdicts if verdict.claim == claim]
-        if own:
-            lines.append(f"{claim.title}: {'; '.join(own)}")
-    return lines + [_best_horizon(task, rows) for task, rows in scores.items() if OURS in rows]
+    parts = []
+    for word in (w for w in WORDS if w in words):
+        count = words.count(word)
+        verb = ("is " if count == 1 else "are ") * (not word.startswith("holds"))
+        parts.append(f"{count} {verb}{word if count == 1 else word.replace('holds', 'hold')}")
+    return listed(parts)
 
 
 def _best_horizon(task: str, rows: Mapping[str, EvalScores]) -> str:
+    """The best horizon on a task; empty without N = 4 and another one."""
     ours = {n: rows[f"ours_n{n}"] for n in _HORIZONS if f"ours_n{n}" in rows}
-    text = f"{task}: {percent(rows[OURS].success_rate)} success at N=4"
-    if len(ours) < 2:
-        return text
+    if len(ours) < 2 or OURS not in rows:
+        return ""
     best = max(ours, key=lambda n: ours[n].reward_per_step)
-    text += f"; of N={', '.join(map(str, ours))} the most reward at N={best}"
-    if ours[best] is rows[OURS]:
-        return text
-    gain = ours[best].gain(rows[OURS])
-    word = gain.word("beyond", same="not beyond")
-    return (
-        f"{text}, {word} chance ({gain}, compared with N=4; chosen on the same scenarios, which "
-        "the interval does not account for)"
-    )
+    beyond = best == 4 or ours[best].gain(rows[OURS]).reward_interval[0] > 0
+    return f"N = {best} ({task}{'' if beyond else ', by no more than chance'})"
+
+
+def _forest(
+    verdicts: Sequence[Verdict], references: Mapping[str, Mapping[str, EvalScores]]
+) -> Plot | None:
+    """The differences of all claims whose task has references."""
+    scale = {
+        task: 100 / (found["oracle"].reward_per_step - found["hold"].reward_per_step)
+        for task, found in references.items()
+        if {"oracle", "hold"} <= found.keys()
+        and found["oracle"].reward_per_step != found["hold"].reward_per_step
+    }
+    shown = [verdict for verdict in verdicts if verdict.task in scale]
+    if not shown:
+        return None
+
+    def paint(figure: Any) -> None:
+        axes = figure.subplots()
+        for k, v in enumerate(shown):
+            interval = scale[v.task] * np.array(v.gain.reward_interval)
+            known = v.word in [u.word for u in shown[:k]]
+            look = {"color": _COLOURS[v.word], "label": None if known else v.word}
+            axes.plot(interval, [k, k], color=_COLOURS[v.word], linewidth=1.5)
+            axes.plot([scale[v.task] * v.gain.reward], [k], "o", markersize=4, **look)
+        axes.axvline(0, color="0.7", linewidth=0.8, zorder=0)
+        axes.set_yticks(range(len(shown)), [f"{v.claim.title}: {v.task}" for v in shown])
+        axes.invert_yaxis()
+        axes.set_xlabel("difference in reward, % of that between oracle and hold")
+        axes.legend(fontsize=8)
+
+    caption = "The paper's claims: differences in reward on the same scenarios, 95 % intervals"
+    return draw("claims", caption, paint, (8.0, 0.9 + 0.25 * len(shown)))
 
 
 def _summary(scores: Scores) -> Table:
@@ -277,19 +385,38 @@ def _summary(scores: Scores) -> Table:
     for name in (name for name in ROWS if any(name in rows for rows in scores.values())):
         line = [ROWS[name].title]
         for task, rows in scores.items():
+            paper = number(ROWS[name].paper_reward(task), "+.4f")
             if name not in rows:
-                line += ["-", "-", "-"]
+                line += ["-", "-", "-", paper]
                 continue
             each = rows[name]
             reward = f"{each.reward_per_step:+.4f}"
             reward = f"**{reward}**" if each.reward_per_step == best[task] else reward
             spread = "" if each.reward_spread is None else f" ± {each.reward_spread:.4f}"
             trials = number(each.reward_trial_spread, ".4f")
-            line += [f"{reward}{spread}", trials, percent(each.success_rate)]
+            line += [f"{reward}{spread}", trials, percent(each.success_rate), paper]
         lines.append(line)
-    heads = [h for task in scores for h in (f"{task}: reward/step", "sd of trials", "success")]
+    columns = ("reward/step", "sd of trials", "success", "the paper's reward")
+    heads = [f"{task}: {columns[0]}" if c == columns[0] else c for task in scores for c in columns]
     title = (
         "Reward per step, ± its standard deviation over trainings where there are several; a trial "
         "is a tenth of the scenarios with one training"
     )
     return Table(title, ("", *heads), lines)
+
+
+def _terms(task: str, rows: Mapping[str, Sequence[str]], records: results.Records) -> list[Table]:
+    """What the reward of each row consists of, if the evaluations recorded it."""
+    shares: dict[str, dict[str, float]] = {}
+    for name, cells in rows.items():
+        every = (records[c]["figures"][task]["planner"]["played"] for c in cells if c in records)
+        found = [played for played in every if "terms" in played]
+        steps = sum(sum(played["steps"]) for played in found)
+        for term in found[0]["terms"] if found else ():
+            total = sum(sum(played["terms"][term]) for played in found)
+            shares.setdefault(ROWS[name].title, {})[term] = total / steps
+    terms = list(dict.fromkeys(term for row in shares.values() for term in row))
+    lines = [
+        (title, *(number(row.get(term), "+.5f") for term in terms)) for title, row in shares.items()
+    ]
+    return [Table(f"{task}: reward per step by term", ("", *terms), lines)] if lines else []

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from egovcp.eval_scores import EvalScores, signed_range
+from egovcp.eval_scores import EvalScores
 from egovcp.spec import ACTION_ETA
 from egovcp_experiment import results
-from egovcp_experiment.grid import Grid, parse_flags
-from egovcp_experiment.report import ExperimentReport, Plot, Table, draw
+from egovcp_experiment.experiments.table1 import MODELS, ROWS
+from egovcp_experiment.grid import Grid, Model, parse_flags
+from egovcp_experiment.report import ExperimentReport, Plot, Table, draw, percent
 from egovcp_experiment.studies.residuals import STEPS
 
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
+#: The model whose Q was trained on returns, with the cells of its row in `table1`.
+_RETURNS: Final = Model("mc", MODELS["mc"])
+_RETURNS_ROWS: Final = {
+    1: ("ours_mc_n1", {**ROWS["ours_mc"].play, "planner.horizon": 1}),
+    4: ("ours_mc", ROWS["ours_mc"].play),
+}
 #: The random walk of `egovcp-collect` by default and of its preset `paper`, as flags.
 _COLLECT_WALK: Final = {"eta": "1.0", "step_ticks": "[5,15]", "boundary": "reflect"}
 _PAPER_WALK: Final = {"eta": str(ACTION_ETA), "step_ticks": "[1,1]", "boundary": "reflect"}
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
+
+type Plans = Mapping[str, Any]
+"""Kind of plans -> its analysis in the study `residuals`."""
+type Scores = Mapping[int, EvalScores]
+"""Horizon -> scores in closed loop."""
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
@@ -30,60 +41,152 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     page = ExperimentReport(
         "Variance: do the errors of Q along a plan average out?",
         sections=[
-            "Residuals are Q along an imagined plan minus the mean return of random walks that the "
+            "Errors are Q along an imagined plan minus the mean return of random walks that the "
             "simulator takes from the same step of the same plan; the variance of that mean is "
-            "taken off. Bounds use the largest correlation between two steps and the least and "
-            "largest variance, as in the paper. `cutting`: returns as in training minus returns to "
-            "the end of the episode. By default Q is trained on the privileged value of planned "
-            "actions, not on returns of random walks: only for models trained with "
-            "`--policy.loss.q_target=mc` does the comparison test the paper's claim."
+            "taken off. The model is `mc`, whose Q was trained on such returns "
+            "(`--policy.loss.q_target=mc`): by default Q is trained on the privileged value of "
+            "planned actions, from which returns of random walks differ without an error. Bounds "
+            "use the largest correlation between two steps and the least and largest variance, as "
+            "in the paper. `cutting`: returns as in training minus returns to the end of the "
+            "episode."
         ],
     )
+    residuals: dict[str, Plans] = {}
+    own: dict[str, Scores] = {}
+    default: dict[str, Scores] = {}
     for task in config.tasks:
         flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
-        cell = grid.sim_study("residuals", task, {**flags, **walk})
-        plays = {n: grid.plays(task, f"horizon_{n}", {"planner.horizon": n}) for n in _HORIZONS}
-        scores = results.all_scores(records, plays, task)
-        page.figures[task] = {"horizons": results.figures_of(scores)}
+        cell = grid.sim_study("residuals", task, {**flags, **walk}, _RETURNS)
         if cell in records:
-            plans = records[cell]["figures"]["plans"]
-            page.figures[task]["residuals"] = plans
-            known = {kind: row for kind, row in plans.items() if "horizons" in row}
-            page.sections += [_table(task, kind, row) for kind, row in known.items()]
-            if known and scores:
-                page.sections.append(_plot(task, known, scores))
-            page.findings += _conclusions(task, known, scores)
-        if scores:
-            rows = {f"N = {n}": each for n, each in scores.items()}
-            page.sections.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
-        play = {"task": task, "episodes": config.play.episodes}
-        cell = grid.sim_study("plan_terms", task, play)
-        if cell in records:
-            _add_terms(page, task, records[cell]["figures"])
+            page.figures[task] = {"residuals": records[cell]["figures"]["plans"]}
+            plans = {k: row for k, row in page.figures[task]["residuals"].items() if "rho" in row}
+            if plans:
+                residuals[task] = plans
+            page.sections += [_table(task, kind, row) for kind, row in plans.items()]
+        rows = {n: (f"ours_n{n}", ROWS[f"ours_n{n}"].play) for n in _HORIZONS}
+        plays = {n: grid.plays(task, *row) for n, row in rows.items()}
+        returns = {n: grid.plays(task, *row, _RETURNS) for n, row in _RETURNS_ROWS.items()}
+        for found, cells in ((default, plays), (own, returns)):
+            if scores := results.all_scores(records, cells, task):
+                found[task] = scores
+        shown = {f"N = {n}": each for n, each in default.get(task, {}).items()}
+        shown |= {f"mc, N = {n}": each for n, each in own.get(task, {}).items()}
+        if shown:
+            page.sections.append(results.comparison(f"{task}: closed loop", shown, "N = 4"))
+            page.figures.setdefault(task, {})["horizons"] = results.figures_of(shown)
+        _add_terms(grid, records, page, task, plays)
+    page.lead = _lead(residuals, own, default)
+    if residuals or default:
+        page.figure = _plot(list(config.tasks), residuals, own, default)
     return page
 
 
-def _add_terms(page: ExperimentReport, task: str, found: Mapping[str, Any]) -> None:
-    """The mean of Q over a plan next to its first and its last term alone."""
-    scores = {
-        term: EvalScores(
+def _lead(
+    residuals: Mapping[str, Plans], own: Mapping[str, Scores], default: Mapping[str, Scores]
+) -> list[str]:
+    rows = {task: plans.get("planner") or plans["random"] for task, plans in residuals.items()}
+    lines = []
+    if rows:
+        each = "; ".join(
+            f"{task}: correlation {_correlation(row)}, {_share(row)}" for task, row in rows.items()
+        )
+        lines.append(
+            "Errors of neighbouring steps, and the share of their variance at N = 1 that averaging "
+            f"over N = 4 leaves (25 % if they were independent), are: {each}."
+        )
+    verdicts = []
+    for task, row in rows.items():
+        scores = own.get(task, {})
+        if len(scores) == len(_RETURNS_ROWS):
+            predicted, other = sorted((4, 1), key=lambda n: row["horizons"][n - 1]["error"])
+            word = scores[predicted].gain(scores[other]).word("confirmed", "contradicted")
+            verdicts.append(f"{task} N = {predicted}, {word}")
+    if verdicts:
+        lines.append(
+            "The mean square error of J predicts which of N = 1 and 4 earns more reward in closed "
+            f"loop with this model: {'; '.join(verdicts)}."
+        )
+    whole = {task: scores for task, scores in default.items() if len(scores) == len(_HORIZONS)}
+    if whole:
+        best = ", ".join(_best(task, scores) for task, scores in whole.items())
+        lines.append(f"The default model earns the most reward at {best}.")
+    return lines
+
+
+def _best(task: str, scores: Scores) -> str:
+    best = max(scores, key=lambda n: scores[n].reward_per_step)
+    if best == 4:
+        return f"N = 4 ({task})"
+    word = scores[best].gain(scores[4]).word("more than", same="not beyond chance above")
+    return f"N = {best} ({task}, {word} N = 4)"
+
+
+def _correlation(row: Mapping[str, Any]) -> str:
+    low, high = row["rho_next_ci95"]
+    return f"{row['rho_next']:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _share(row: Mapping[str, Any]) -> str:
+    """A dash if the variance of N = 1 may be zero."""
+    if row["share_4"] is None:
+        return "-"
+    low, high = row["share_4_ci95"]
+    return f"{100 * row['share_4']:.0f} % ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _add_terms(
+    grid: Grid,
+    records: results.Records,
+    page: ExperimentReport,
+    task: str,
+    plays: Mapping[int, list[str]],
+) -> None:
+    """The mean of Q over a plan next to its first and its last term alone, and to one step."""
+    kept = ("task", "episodes", "seed")
+    flags = {
+        name: value
+        for name, value in grid.scenarios(task).items()
+        if name in kept or name.startswith("env.")
+    }
+    cell = grid.study("plan_terms", task, flags)
+    if cell not in records:
+        return
+    found = records[cell]["figures"]
+    terms = {
+        f"{term} term": EvalScores(
             np.array([row["reward"]]), np.array([row["steps"]]), np.array([row["success"]], float)
         )
         for term, row in found["terms"].items()
     }
-    title = f"{task}: plans of N = {found['horizon']}, chosen by the mean of Q or by one term"
-    page.sections.append(results.comparison(title, scores, "mean"))
+    n = found["horizon"]
+    first = {k: plays[k][:1] for k in (n, 1) if k in plays}  # of the same training
+    names = {n: "planner", 1: "one step"}
+    played = results.all_scores(records, first, task)
+    scores = {names[k]: each for k, each in played.items()} | terms
+    title = (
+        f"{task}: plans of N = {n}, chosen by the mean of Q (planner) or by one term of it, and "
+        "plans of one step"
+    )
+    page.sections.append(results.comparison(title, scores, "planner"))
     spread = ", ".join(f"{value / found['return_std']:.2f}" for value in found["spread"])
-    alone = ", ".join(
-        f"{term} term {scores[term].gain(scores['mean']).word()} ({scores[term].success_rate:.1%})"
-        for term in ("first", "last")
-    )
     page.findings.append(
-        f"{task}: compared with the mean of Q over a plan ({scores['mean'].success_rate:.1%}), by "
-        f"reward: {alone}; over random plans the terms have standard deviations of {spread} of "
-        "that of the return"
+        f"{task}: the terms of random plans have standard deviations of {spread} of that of the "
+        "return"
     )
-    page.figures[task]["terms"] = {**results.figures_of(scores), "spread": found["spread"]}
+    words = [
+        f"{name} {scores[name].gain(scores['planner']).word()} ({percent(each.success_rate)})"
+        for name, each in scores.items()
+        if "planner" in scores and name != "planner"
+    ]
+    if words:
+        page.findings.append(
+            f"{task}: compared with the planner ({percent(scores['planner'].success_rate)}), by "
+            f"reward: {', '.join(words)}"
+        )
+    page.figures.setdefault(task, {})["terms"] = {
+        **results.figures_of(scores),
+        "spread": found["spread"],
+    }
 
 
 def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
@@ -105,60 +208,49 @@ def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
         *("N", "sigma of step N-1", "its bias", "cutting", "Var of J_N's error"),
         *("V_lb", "V_ub", "bias of J_N", "mean square"),
     )
-    title = f"{task}, {_PLANS[kind]} ({row['plans']}; largest correlation {row['rho_max']:.2f})"
+    title = (
+        f"{task}, {_PLANS[kind]} ({row['plans']}; correlation of neighbouring steps "
+        f"{_correlation(row)}, largest {row['rho_max']:.2f}; variance that N = 4 leaves of N = 1: "
+        f"{_share(row)})"
+    )
     return Table(title, head, rows)
 
 
-def _conclusions(
-    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, EvalScores]
-) -> list[str]:
-    lines = []
-    for kind, row in plans.items():
-        one, four = row["horizons"][0], row["horizons"][3]
-        share = four["variance"] / one["variance"] if one["variance"] > 0 else math.nan
-        lines.append(
-            f"{task}, {_PLANS[kind]}: errors of neighbouring steps correlate by "
-            f"{row['rho_next']:.2f} (largest {row['rho_max']:.2f}); averaging over N = 4 leaves "
-            f"{share:.0%} of the variance of N = 1, where independent errors would leave 25 %"
-        )
-    if plans and len(scores) == len(_HORIZONS):
-        row = plans.get("planner") or next(iter(plans.values()))
-        predicted = min(row["horizons"], key=lambda at: at["error"])["n"]
-        best = max(scores, key=lambda n: scores[n].reward_per_step)
-        gain = scores[best].gain(scores[predicted])
-        word = gain.word("not as predicted", same="no more than chance, so no contradiction")
-        word = "as predicted" if best == predicted else word
-        lines.append(
-            f"{task}: the mean square error is least at N = {predicted}; reward in closed loop is "
-            f"best at N = {best}, by {gain.reward:+.5f} a step (95 % "
-            f"{signed_range(gain.reward_interval)}; it does not account for the choice of the best "
-            f"on the same scenarios) compared with N = {predicted}: {word}"
-        )
-    return lines
-
-
 def _plot(
-    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, EvalScores]
+    tasks: list[str],
+    residuals: Mapping[str, Plans],
+    own: Mapping[str, Scores],
+    default: Mapping[str, Scores],
 ) -> Plot:
     def paint(figure: Any) -> None:
-        left, right = figure.subplots(1, 2)
-        for k, (kind, row) in enumerate(plans.items()):
-            at = [h["n"] for h in row["horizons"]]
-            low, high = ([h[name] for h in row["horizons"]] for name in ("v_lb", "v_ub"))
-            left.fill_between(at, low, high, color=f"C{k}", alpha=0.12, linewidth=0)
-            found = [h["variance"] for h in row["horizons"]]
-            left.plot(at, found, "o-", color=f"C{k}", label=kind)
-            left.plot(at, [found[0] / n for n in at], ":", color=f"C{k}")
-        left.set(xlabel="N", ylabel="variance of J_N's error")
-        left.legend(fontsize=8)
-        rewards = [each.reward_per_step for each in scores.values()]
-        right.plot(list(scores), rewards, "o-", color="C2")
-        ranges = np.array([each.reward_interval for each in scores.values()]).T
-        right.fill_between(list(scores), *ranges, color="C2", alpha=0.15, linewidth=0)
-        right.set(xlabel="N", ylabel="reward per step, closed loop")
+        rows = figure.subplots(len(tasks), 2, squeeze=False, sharex=True)
+        for task, (left, right) in zip(tasks, rows, strict=True):
+            for k, (kind, row) in enumerate(residuals.get(task, {}).items()):
+                at = [h["n"] for h in row["horizons"]]
+                low, high = ([h[name] for h in row["horizons"]] for name in ("v_lb", "v_ub"))
+                left.fill_between(at, low, high, color=f"C{k}", alpha=0.12, linewidth=0)
+                found = [h["variance"] for h in row["horizons"]]
+                left.plot(at, found, "o-", color=f"C{k}", label=_PLANS[kind])
+                left.plot(at, [found[0] / n for n in at], ":", color=f"C{k}")
+            for colour, label, scores in (
+                ("C2", "default model", default.get(task)),
+                ("C3", "mc", own.get(task)),
+            ):
+                if scores:
+                    means = [each.reward_per_step for each in scores.values()]
+                    ranges = np.array([each.reward_interval for each in scores.values()]).T
+                    right.plot(list(scores), means, "o-", color=colour, label=label)
+                    right.fill_between(list(scores), *ranges, color=colour, alpha=0.15, linewidth=0)
+            left.set_ylabel(f"{task}: variance")
+            right.set_ylabel("reward per step")
+        for axes in rows[-1]:
+            axes.set_xlabel("N")
+        for axes in rows[0]:
+            if axes.has_data():
+                axes.legend(fontsize=8)
 
     caption = (
-        f"{task}: measured variance between its bounds (shaded), variance of independent "
-        "errors (dotted), and reward against N"
+        "Left: variance of J_N's error between its bounds (shaded), and that of independent errors "
+        "(dotted), model mc; right: reward in closed loop"
     )
-    return draw(f"bounds-{task}", caption, paint)
+    return draw("horizons", caption, paint, (8.0, 0.6 + 2.2 * len(tasks)))

@@ -1,7 +1,8 @@
 """Behaviour of a policy with and without events.
 
 ball   distance of the hands from their start in empty scenes, and before and after a throw
-wall   contact in undisturbed scenes; whether the hands return after a push
+wall   contact in undisturbed scenes; contact of the hands after a push, whether they return, and
+       the value that the model sees in the oracle's bracing pose, compared with the neutral pose
 arch   height of the pelvis near an arch and far from it
 """
 
@@ -12,11 +13,14 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+import torch
 
 from egovcp.artifact import Artifact
 from egovcp.eval_scores import Array, bootstrap, wilson
+from egovcp.model import Carry
+from egovcp.plan import held_value
 from egovcp.sim.config import EnvConfig
-from egovcp.spec import PLANNER_HZ
+from egovcp.spec import PLANNER_DT, PLANNER_HZ
 from egovcp_experiment.config import TASKS
 from egovcp_experiment.studies import study
 
@@ -50,6 +54,11 @@ class BehaviourTrace:
     """Horizontal, m/s."""
     ahead: list[float] = field(default_factory=list)
     """x of the object in the pelvis frame, m."""
+    hands_on: list[bool] = field(default_factory=list)
+    """Whether a hand touches the object."""
+    bracing: list[tuple[float, float]] = field(default_factory=list)
+    """Q, and J of holding it, of the oracle's pose while it braces, minus those of the neutral
+    pose, in standard deviations of the return."""
     touched: bool = False
     """Whether the robot has touched the object."""
     away: bool = False
@@ -76,6 +85,12 @@ class BehaviourTrace:
         back = bool((window < NEAR_NEUTRAL_M).any())
         return back if back or len(window) == BACK_TICKS else None
 
+    @property
+    def contact_s(self) -> float | None:
+        """Time from the push to the first contact of a hand, s; None without."""
+        times = [s for s, on in zip(self.since, self.hands_on, strict=True) if on and s >= 0]
+        return times[0] + PLANNER_DT if times else None
+
 
 type Traces = list[BehaviourTrace]
 
@@ -93,10 +108,16 @@ def measure(config: BehaviourConfig) -> None:
 def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) -> Traces:
     """One trace per episode."""
     traces = [BehaviourTrace() for _ in range(config.episodes)]
+    oracle: dict[int, Array] = {}  # of an episode, in its present state
     for step in study.play_episodes(artifact, env_config, config):
         state = step.state
         for row in step.live:
-            trace = traces[step.scenarios[row].episode]
+            episode, instance = step.scenarios[row].episode, step.env.instances[row]
+            trace = traces[episode]
+            if config.task == "wall":
+                if episode in oracle and oracle[episode].any():
+                    trace.bracing.append(_bracing(artifact, step.carry.row(row), oracle[episode]))
+                oracle[episode] = instance.task.oracle()
             trace.since.append(float(state.since_event[row]))
             trace.hands.append(state.hands_b[row])
             trace.action.append(step.result.sent_action[row].copy())
@@ -104,9 +125,21 @@ def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) 
             trace.speed.append(float(np.hypot(*state.pelvis_velocity_w[row, :2])))
             trace.ahead.append(float(state.object_b[row, 0]))
             trace.away = abs(step.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
-            trace.touched |= bool(step.env.instances[row].task.forces.any())
+            trace.hands_on.append(instance.contacts()["hands"])
+            trace.touched |= bool(instance.task.forces.any())
             trace.fallen = bool(step.result.terminated[row])
     return traces
+
+
+@torch.no_grad()
+def _bracing(artifact: Artifact, carry: Carry, pose: Array) -> tuple[float, float]:
+    """`BehaviourTrace.bracing` of a pose (7,)."""
+    model = artifact.world_model
+    poses = torch.as_tensor(np.stack([pose, np.zeros_like(pose)])[None]).to(carry.h)
+    q = model.value(model.expand_candidates(carry), poses)[0]
+    j = held_value(model, carry, poses, artifact.planner)[0]
+    scale = float(model.return_std)
+    return float(q[0] - q[1]) / scale, float(j[0] - j[1]) / scale
 
 
 def _ball(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
@@ -121,7 +154,13 @@ def _ball(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str,
 def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
     pushed = [trace for trace in eventful if not trace.away]
     back = [flag for trace in pushed if (flag := trace.hands_back) is not None]
+    times = [trace.contact_s for trace in pushed]
+    values = [np.array(trace.bracing) for trace in pushed if trace.bracing]
     return {
+        "hand_contact": _share([time is not None for time in times]),
+        "contact_s": _means([np.array([time]) for time in times if time is not None]),
+        "bracing_q": _means([each[:, 0] for each in values]),
+        "bracing_j": _means([each[:, 1] for each in values]),
         "undisturbed_without_contact": _share([not trace.touched for trace in empty]),
         "braced_for_s": config.env.wall.disturbed_time,
         "hands_back": _share(back),

@@ -1,11 +1,14 @@
 """Closed loop with single terms of the value of a plan instead of their mean (section III-D).
 
-    mean    V = 1/N sum_{k<N} Q(h_k, z^_k, a_k)      (equation 15)
+    mean    V = 1/N sum_{k<N} Q(h_k, z^_k, a_k)      (equation 15), the planner itself
     first   V = Q(h_0, z_0, a_0)
     last    V = Q(h_{N-1}, z^_{N-1}, a_{N-1})
 
-The candidates are plans of N steps in all three, their costs too. If the mean is better because
-errors of its terms average out, it is better than each of them. Predicted failures do not count.
+The candidates are plans of N steps in all three, their costs and the rule for predicted failures
+too. If the mean is better because errors of its terms average out, it is better than each of them.
+The scenarios are those of ``egovcp-eval`` with the same seed, which plays the mean, and with
+``--planner.horizon=1`` one step: `first` differs from it only in its candidates, whose steps after
+the first, towards the target, cost action changes and poses although Q of them does not count.
 
 Spread: standard deviation of each term over random plans from one state, root mean square over
 states. The plans diverge with each step, so later terms differ more between them.
@@ -13,8 +16,8 @@ states. The plans diverge with each step, so later terms differ more between the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -24,90 +27,97 @@ from torch import Tensor
 
 from egovcp.artifact import Artifact
 from egovcp.errors import UsageError
-from egovcp.model import Carry, WorldModel
-from egovcp.plan import Policy
+from egovcp.model import Carry
+from egovcp.plan import PlanEvaluator, Policy
+from egovcp.plan.backends import make_evaluator
 from egovcp.plan.objective import PlanValue
 from egovcp.plan.search import random_walk, target_deltas
+from egovcp.sim.scenario import HELD_OUT
 from egovcp_experiment.studies import study
 
-#: Name -> V (...) from the values (..., N) of the steps of a plan.
-TERMS: Final[Mapping[str, Callable[[Tensor], Tensor]]] = {
-    "mean": lambda values: values.mean(-1),
-    "first": lambda values: values[..., 0],
-    "last": lambda values: values[..., -1],
-}
+TERMS: Final = ("first", "last")
 _PLANS: Final = 64  # random plans of a state
 _EVERY: Final = 5  # ticks between the states of the spread
 
 
 @dataclass(frozen=True)
 class PlanTermsConfig(study.SimStudyConfig):
-    """Play with the mean of Q over a plan, and with its first or last term alone."""
+    """Play with the first or last term of the value of a plan alone, instead of their mean, on the
+    scenarios of egovcp-eval."""
 
     def load(self) -> Artifact:
-        """As `SimStudyConfig.load`; refuses another objective."""
+        """As `SimStudyConfig.load`; refuses another objective, and sampled latents."""
         artifact = super().load()
-        if artifact.planner.objective != "value":
-            raise UsageError(
-                f"--planner.objective={artifact.planner.objective}: expected value, whose terms "
-                "are compared"
-            )
+        for option, expected in (("objective", "value"), ("latent", "mean")):
+            found = getattr(artifact.planner, option)
+            if found != expected:
+                raise UsageError(
+                    f"--planner.{option}={found}: expected {expected}, whose terms are compared"
+                )
         return artifact
 
 
 class TermEvaluator(NamedTuple):
-    """A `PlanEvaluator` of one term, or of their mean."""
+    """A `PlanEvaluator` of the n-th value of a plan as the planner counts it, n V_n - (n-1) V_{n-1}
+    from means over n and n-1 steps."""
 
-    model: WorldModel
-    term: str
+    n: int
+    mean: PlanEvaluator[Carry]
+    """V_n."""
+    shorter: PlanEvaluator[Carry] | None
+    """V_{n-1}; None of the first."""
 
     def at(self, carry: Carry) -> PlanValue:
         """See `PlanEvaluator`."""
+        mean = self.mean.at(carry)
+        shorter = self.shorter.at(carry) if self.shorter else None
 
         def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
-            values = term_values(self.model, carry, actions)
-            return TERMS[self.term](values)
+            n = self.n
+            value = n * mean(actions[..., :n, :], generator)
+            if shorter is None:
+                return value
+            return value - (n - 1) * shorter(actions[..., : n - 1, :], generator)
 
         return plan_value
 
 
+def term_evaluator(artifact: Artifact, n: int) -> TermEvaluator:
+    """The evaluator of the ``n``-th value, from 1, with the backend of the planner."""
+
+    def mean(steps: int) -> PlanEvaluator[Carry]:
+        return make_evaluator(artifact.world_model, replace(artifact.planner, horizon=steps))
+
+    return TermEvaluator(n, mean(n), mean(n - 1) if n > 1 else None)
+
+
 class TermPolicy(Policy):
-    """The policy of an artifact whose planner maximises one term."""
+    """The policy of an artifact whose planner maximises one of `TERMS`."""
 
     def __init__(self, artifact: Artifact, term: str, num_envs: int, seed: int) -> None:
         super().__init__(artifact.world_model, artifact.planner, num_envs, seed)
-        self._term = term
+        self._term = term_evaluator(artifact, 1 if term == "first" else artifact.planner.horizon)
 
     def prepare(self) -> TermEvaluator:
         """See `Policy.prepare`."""
-        return TermEvaluator(self.model, self._term)
-
-
-@torch.no_grad()
-def term_values(model: WorldModel, carry: Carry, actions: Tensor) -> Tensor:
-    """Q of each step of plans (E, M, N, 7) from the states (E, ...), (E, M, N)."""
-    state = model.expand_candidates(carry)
-    found = []
-    for k, action in enumerate(actions.unbind(-2)):
-        state = model.imagine(state, actions[..., k - 1, :]) if k else state
-        found.append(model.value(state, action))
-    return torch.stack(found, -1)
+        return self._term
 
 
 def measure(config: PlanTermsConfig) -> None:
     """Play with each term, and write rewards and spreads."""
     artifact = config.load()
     generator = torch.Generator().manual_seed(config.seed)
+    terms = [term_evaluator(artifact, n + 1) for n in range(artifact.planner.horizon)]
     variances: list[Tensor] = []
 
     def collect(step: study.PlayedStep) -> None:
-        """Add the variances of all terms, in the states of all three planners."""
+        """Add the variances of all terms, in the states of both planners."""
         rows = [row for row in step.live if step.tick[row] % _EVERY == 0]
         if rows:
             carry = step.carry.map(lambda x: x[rows])
             sent = torch.as_tensor(step.env.sent_action[rows], dtype=torch.float32)
             plans = _random_plans(artifact, sent, generator)
-            variances.append(term_values(artifact.world_model, carry, plans).var(1))
+            variances.append(torch.stack([t.at(carry)(plans, None).var(1) for t in terms], -1))
 
     config.write(
         {
@@ -130,7 +140,7 @@ def _play(
     reward, steps = np.zeros(config.episodes), np.zeros(config.episodes, np.int64)
     success = np.zeros(config.episodes, np.bool_)
     policy = partial(TermPolicy, artifact, term)
-    for step in study.play_episodes(artifact, config.env, config, policy):
+    for step in study.play_episodes(artifact, config.env, config, policy, HELD_OUT):
         look(step)
         for row in step.live:
             episode = step.scenarios[row].episode

@@ -18,7 +18,7 @@ There are two kinds of plans: the planner's own, which maximise Q^, and random o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
@@ -31,7 +31,7 @@ from egovcp.artifact import Artifact, returns_of
 from egovcp.bounds import bounded
 from egovcp.data import ReturnConfig
 from egovcp.errors import UsageError
-from egovcp.eval_scores import Array
+from egovcp.eval_scores import Array, bootstrap
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.search import random_walk
 from egovcp.sim.config import EnvConfig
@@ -43,6 +43,7 @@ from egovcp.terminal import echo
 from egovcp_experiment.studies import study
 
 STEPS: Final = 6  # the longest horizon of table I
+_NEGLIGIBLE: Final = 0.01  # share of the largest variance of a step
 #: Ticks from the event to the plan; episodes take them in turn.
 _AFTER: Final = {"ball": (-5, 4, 8, 12, 16), "wall": (-5, 1, 4, 8), "arch": (-2, 20, 40, 60, 80)}
 
@@ -208,7 +209,11 @@ def _returns(
 
 
 def analysis(value: Array, short: Array, whole: Array) -> dict[str, Any]:
-    """Variances, correlations, bounds and biases; of fewer than three plans only their number.
+    """Variances, correlations, bounds and biases, of fewer than three plans only their number.
+
+    Intervals are 95 % bootstrap intervals over plans. ``share_4`` is the variance of J_4's error
+    over that of J_1; it and its interval are None if the interval of the latter reaches zero or 1 %
+    of the largest variance of a step.
 
     Args:
         value: (P, K) Q^ along P plans of K steps.
@@ -218,35 +223,69 @@ def analysis(value: Array, short: Array, whole: Array) -> dict[str, Any]:
     if len(value) < 3:
         return {"plans": len(value)}
     errors = value - short.mean(2)  # (P, K)
-    noise = (short.var(2, ddof=1) / short.shape[2]).mean(0)
-    covariance = _positive(np.cov(errors.T, ddof=1) - np.diag(noise))
-    rho = _correlation(covariance)
+    noise = short.var(2, ddof=1) / short.shape[2]
+    covariance = _covariance(errors, noise)
+    rho = _correlation(_positive(covariance))
     cut = (short - whole).mean(2)
+
+    def interval(statistic: Callable[[Array], Array]) -> list[float]:
+        return list(bootstrap(lambda i: statistic(_covariance(errors[i], noise[i])), len(errors)))
+
+    known = interval(lambda found: found[:, 0, 0])[0] > _NEGLIGIBLE * covariance.diagonal().max()
+    positive = _positive(covariance)
     return {
         "plans": len(value),
-        "sigma": np.sqrt(np.diag(covariance)).tolist(),
+        "sigma": np.sqrt(np.diag(positive)).tolist(),
         "rho": rho.tolist(),
         "rho_max": _largest(rho),
-        "rho_next": float(np.mean(np.diag(rho, 1))) if len(rho) > 1 else None,
-        "return_noise_variance": noise.tolist(),
+        "rho_next": float(_rho_next(covariance)),
+        "rho_next_ci95": interval(_rho_next),
+        "share_4": float(_share(covariance)) if known else None,
+        "share_4_ci95": interval(_share) if known else None,
+        "return_noise_variance": noise.mean(0).tolist(),
         "bias": errors.mean(0).tolist(),
         "bias_of_cutting": cut.mean(0).tolist(),
-        "horizons": [_horizon(n, covariance, errors) for n in range(1, len(covariance) + 1)],
+        "horizons": [_horizon(n, positive, errors) for n in range(1, len(positive) + 1)],
     }
 
 
+def _covariance(errors: Array, noise: Array) -> Array:
+    """(..., K, K) from errors (..., P, K), less the variances (..., P, K) of the mean returns."""
+    centred = errors - errors.mean(-2, keepdims=True)
+    covariance = centred.swapaxes(-1, -2) @ centred / (errors.shape[-2] - 1)
+    found: Array = covariance - noise.mean(-2)[..., None] * np.eye(errors.shape[-1])
+    return found
+
+
 def _positive(covariance: Array) -> Array:
-    """The nearest positive semidefinite matrix: subtracting noise may give negative variances."""
+    """The nearest positive semidefinite matrices: subtracting noise may give negative variances."""
     values, vectors = np.linalg.eigh(covariance)
-    fixed: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    fixed: Array = (vectors * np.maximum(values, 0.0)[..., None, :]) @ vectors.swapaxes(-1, -2)
     return fixed
 
 
 def _correlation(covariance: Array) -> Array:
-    sigma = np.sqrt(np.diag(covariance))
-    scale = np.outer(sigma, sigma)
-    rho: Array = np.divide(covariance, scale, out=np.eye(len(sigma)), where=scale > 0)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    scale = sigma[..., None] * sigma[..., None, :]
+    one = np.broadcast_to(np.eye(sigma.shape[-1]), covariance.shape).copy()
+    rho: Array = np.divide(covariance, scale, out=one, where=scale > 0)
     return rho
+
+
+def _rho_next(covariance: Array) -> Array:
+    """(...) mean correlation of neighbouring steps."""
+    rho = _correlation(_positive(covariance))
+    mean: Array = np.diagonal(rho, 1, axis1=-2, axis2=-1).mean(-1)
+    return mean
+
+
+def _share(covariance: Array) -> Array:
+    """(...) variance of J_4's error over that of J_1."""
+    part = _positive(covariance)[..., :4, :4]
+    one = part[..., 0, 0]
+    nothing = np.full_like(one, np.inf)
+    share: Array = np.divide(part.mean((-2, -1)), one, out=nothing, where=one > 0)
+    return share
 
 
 def _largest(rho: Array) -> float:

@@ -154,13 +154,15 @@ def play_episodes(
     env_config: EnvConfig,
     config: SimStudyConfig,
     make_policy: Callable[[int, int], Policy] | None = None,
+    purpose: int = STUDIES,
 ) -> Iterator[PlayedStep]:
     """Play the scenarios of ``config`` in the scenes of ``env_config``, in groups of `_ENVS`.
 
     Args:
         make_policy: number of robots, seed -> policy; None: that of the artifact.
+        purpose: number that `egovcp.sim.scenario` adds to seeds of this purpose.
     """
-    scenarios = [Scenario(config.task, STUDIES + config.seed, i) for i in range(config.episodes)]
+    scenarios = [Scenario(config.task, purpose + config.seed, i) for i in range(config.episodes)]
     with tqdm(total=len(scenarios), unit="ep", desc=f"play {config.task}") as bar:
         for group in batched(scenarios, _ENVS):
             with closing(VectorEnv(env_config, len(group))) as env:

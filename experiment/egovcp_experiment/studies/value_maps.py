@@ -1,8 +1,10 @@
-"""Q over the x-z plane of a hand's target while the ball approaches (figure 7a).
+"""J over the x-z plane of a hand's target while the ball approaches (figure 7a).
 
-Maps are taken before the throw and at shares of the flight, of the hand on whose side the ball
-arrives. The maps of one episode are kept; over all episodes the spread of the map (best minus
-worst) and the height between its best point and the ball's aim are averaged.
+J is Q minus the planner's cost of holding the pose (`egovcp.plan.held_value`). Maps are taken
+before the throw and at shares of the flight, of the hand on whose side the ball arrives. Those of
+one episode are kept, with what the rate limit can reach from the last action: Q was fitted to such
+actions only. Over all episodes the spread of the map (best minus worst) and the height between its
+best point and the ball's aim are averaged.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
+from egovcp.eval_scores import Array
 from egovcp.plan import hand_grid, value_map
-from egovcp.spec import PLANNER_DT
+from egovcp.plan.value_map import HAND_AXES
+from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_RATE_LIMIT, PLANNER_DT
 from egovcp_experiment.studies import study
 
 BEFORE_S: Final = 0.4  # time of the first map before the throw
@@ -39,6 +43,7 @@ class _Map:
     hand: Literal["left", "right"]
     values: NDArray[np.float64]  # (n, m) over z, x
     best: tuple[float, float]  # x and z of the largest value, m
+    reach: tuple[list[float], list[float]]  # least and largest x, and z, within the rate limit, m
 
 
 type Aims = dict[int, tuple[float, float]]
@@ -49,6 +54,7 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
     """Each map once per episode."""
     maps: dict[tuple[int, str], _Map] = {}
     aims: Aims = {}
+    sent: dict[int, Array] = {}
     for step in study.play_episodes(artifact, config.env, config):
         for row in step.live:
             episode, facts = step.scenarios[row].episode, step.env.parameters[row]
@@ -58,12 +64,24 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
                 hand: Literal["left", "right"] = "left" if facts["aim_lateral"] > 0 else "right"
                 grid, carry = hand_grid(hand), step.carry.row(row)
                 action = torch.as_tensor(step.decision.action[row : row + 1]).to(carry.h)
-                values = value_map(artifact.world_model, carry, action, hand, grid)[0]
+                model, planner = artifact.world_model, artifact.planner
+                values = value_map(model, carry, action, hand, grid, planner)[0]
                 found = values.double().cpu().numpy()
                 z, x = np.unravel_index(int(found.argmax()), found.shape)
                 best = (float(grid.x[x]), float(grid.z[z]))
-                maps[episode, name] = _Map(episode, name, int(step.tick[row]), hand, found, best)
+                reach = _reach(sent.get(episode, np.zeros(ACTION_DIM)), hand)
+                tick = int(step.tick[row])
+                maps[episode, name] = _Map(episode, name, tick, hand, found, best, reach)
+            sent[episode] = step.result.sent_action[row].copy()
     return list(maps.values()), aims
+
+
+def _reach(last: Array, hand: Literal["left", "right"]) -> tuple[list[float], list[float]]:
+    """Least and largest x, and z, m, of a hand one step after the action ``last`` (7,)."""
+    ends = np.clip([last - ACTION_RATE_LIMIT, last + ACTION_RATE_LIMIT], -1.0, 1.0)
+    x, _, z = HAND_AXES[hand]
+    metric = ACTION_BOX.to_metric(ends)
+    return metric[:, x].tolist(), metric[:, z].tolist()
 
 
 def _due(since: float, flight: float) -> str:
@@ -109,7 +127,7 @@ def _shown(maps: list[_Map], aims: Aims) -> dict[str, Any]:
     chosen = max(sorted(spread), key=spread.__getitem__)
     shown = [m for m in maps if m.episode == chosen]
     grid = hand_grid(shown[0].hand)
-    names = ("moment", "tick", "hand", "best")
+    names = ("moment", "tick", "hand", "best", "reach")
     return {
         "x": grid.x.tolist(),
         "z": grid.z.tolist(),

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from egovcp.plan.config import PlannerConfig
 from egovcp.plan.value_map import HAND_AXES, HandGrid, hand_grid, value_map
-from egovcp.spec import ACTION_BOX
+from egovcp.spec import ACTION_BOX, RETURN_STEPS
 from egovcp.testing import toy_model
 from tests.support.worlds import PointWorld
 
@@ -49,6 +50,17 @@ def test_every_point_is_the_value_of_that_action(hand: Hand) -> None:
                 expected = model.value(carry, moved)
             torch.testing.assert_close(values[:, row, column], expected, rtol=1e-4, atol=1e-5)
     assert values.std() > 0
+
+
+def test_the_cost_of_holding_a_pose_is_subtracted() -> None:
+    model, grid = toy_model(), hand_grid("left", rows=3, columns=2)
+    carry, action = model.initial(1), torch.full((1, 7), 0.5)
+    config = PlannerConfig(pose_cost=0.1, action_rate_cost=7.0)
+    free = value_map(model, carry, action, "left", grid)
+    held = value_map(model, carry, action, "left", grid, config)
+    pose = (1 + 1 + 5 * 0.25) / 7  # x and z at the ends of the box
+    steps = model.discount ** torch.arange(RETURN_STEPS)
+    assert (free - held)[0, 0, 0] == pytest.approx(0.1 * pose * float(steps.sum()), rel=1e-4)
 
 
 def test_the_grid_spans_the_box_of_its_hand() -> None:

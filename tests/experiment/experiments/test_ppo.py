@@ -125,17 +125,17 @@ def results() -> dict[str, Mapping[str, Any]]:
 
 
 def test_conclusions_follow_from_the_scores() -> None:
-    findings = PPO.report(CONFIG, results()).findings
-    assert findings[0].startswith(
-        "ball: the planner 90.0 % success from 200k steps, PPO 50.0 % after 1000 steps: PPO is "
-        "worse (reward per step -0.08000, 95 % -0.08000 to -0.08000; success -40.0 points"
-    )
-    assert findings[1].startswith(
-        "ball: compared with the neutral pose, PPO is better (reward per step +0.01000"
-    )
-    assert findings[2].startswith(
-        "ball: compared with its first policy, PPO's last is no different beyond"
-    )
+    found = PPO.report(CONFIG, results())
+    assert found.lead == [
+        "The planner succeeds in 90.0 % of ball.",
+        "PPO succeeds in 50.0 % of ball after 1000 steps.",
+        "By reward, compared with the planner, PPO is worse on ball.",
+    ]
+    assert found.findings == [
+        "ball: by reward, the last policy of PPO is better compared with the neutral pose and "
+        "no different beyond chance compared with its first policy."
+    ]
+    assert found.figures["ball"]["planner_transitions"] == 200_100
 
 
 def test_the_transitions_of_a_given_dataset_are_counted(tmp_path: Path) -> None:
@@ -144,11 +144,10 @@ def test_the_transitions_of_a_given_dataset_are_counted(tmp_path: Path) -> None:
     config = replace(CONFIG, data=DataConfig(roots={"ball": str(tmp_path)}))
     found = PPO.report(config, results())
     assert found.figures["ball"]["planner_transitions"] == 3210
-    assert found.findings[0].startswith("ball: the planner 90.0 % success from 3210 steps, PPO")
 
 
 def test_the_transitions_of_a_given_policy_are_unknown() -> None:
     config = replace(CONFIG, train=replace(CONFIG.train, policies={"ball": "a/ball"}))
     found = PPO.report(config, results())
     assert "planner_transitions" not in found.figures["ball"]
-    assert found.findings[0].startswith("ball: the planner 90.0 % success, PPO 50.0 % after 1000")
+    assert len(found.lead) == 3

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egovcp.sim.config import EnvConfig
 from egovcp_experiment.cell import ARTIFACT, COLLECT, PLAY, Cell, CellOutput
 from egovcp_experiment.config import SCALES
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.experiments.generalise import _EDGES, conditions
 from egovcp_experiment.experiments.interpret import _edges
 from egovcp_experiment.report import ExperimentReport, Plot, Table
+from egovcp_experiment.studies.open_loop import HORIZONS
 from egovcp_experiment.studies.plan_time import SEARCHES
+from egovcp_experiment.studies.residuals import analysis
 
 _PARTS = "env.sequence.parts"
+_HORIZON_CELLS = ("play-ball-ours_n1-s0", "play-ball-ours_n4-s0")
 
 CLOSED_LOOP = (
     "generalise",
@@ -89,22 +94,70 @@ def test_tables_agree_with_their_heads(name: str, share: float) -> None:
 
 @pytest.mark.parametrize("name", CLOSED_LOOP)
 def test_every_task_has_a_conclusion(name: str) -> None:
-    findings = " ".join(report(name, 1.0).findings)
+    found = report(name, 1.0)
+    findings = " ".join([*found.lead, *found.findings])
     if name != "variance":  # its verdicts need residuals
         for task in ("ball", "wall", "arch"):
             assert f"{task}" in findings
 
 
-def test_a_significant_loss_is_reported() -> None:
-    """Half of the scenes lost, in one condition only."""
+@pytest.mark.parametrize("name", ["generalise", "planners"])
+def test_pages_begin_with_three_sentences_and_a_figure(name: str) -> None:
+    found = report(name, 1.0)
+    assert len(found.lead) == 3
+    assert found.figure is not None
+
+
+@pytest.mark.parametrize("lost", [0, 6, 60])
+def test_a_verdict_needs_the_whole_interval_on_one_side_of_the_bar(lost: int) -> None:
+    """Scenes lost of 120, in one condition only."""
     found = records("generalise", 1.0)
     for cell in EXPERIMENTS["generalise"].cells(SCALES["small"]()):
         if cell.command is PLAY and cell.flags["controllers"] == "planner":
             row = found[cell.name]["figures"][cell.flags["task"]]["planner"]["played"]
-            row["success"] = [True] * 20 if "box" not in cell.name else [False] * 10 + [True] * 10
-    findings = EXPERIMENTS["generalise"].report(SCALES["small"](), found).findings
-    assert "ball: worse by more than chance, points: `box` -50" in findings
-    assert not [line for line in findings if line.startswith("wall: worse")]
+            failures = lost if "thickest" in cell.name else 0
+            scenes = range(120)
+            row |= {"episode": [*scenes], "steps": [100] * 120, "reward": [1.0] * 120}
+            row["success"] = [k >= failures for k in scenes]
+    made = EXPERIMENTS["generalise"].report(SCALES["small"](), found)
+    tables = [part for part in made.sections if isinstance(part, Table)]
+    (table,) = (t for t in tables if t.title == "arch: within the training ranges")
+    verdicts = {row[0]: row[table.head.index("verdict")] for row in table.rows}
+    words = {0: "at most 3 points lost", 6: "undecided", 60: "more than 3 points lost"}
+    assert verdicts.pop("as_trained") == ""
+    assert verdicts.pop("thickest") == words[lost]
+    assert set(verdicts.values()) == {words[0]}
+    assert f"the worst is `thickest` of arch ({-100 * lost / 120:+.0f} points)" in made.lead[0] or not lost
+
+
+def test_rewards_of_longer_episodes_are_not_compared() -> None:
+    tables = [part for part in report("generalise", 1.0).sections if isinstance(part, Table)]
+    (table,) = (t for t in tables if t.title == "arch: beyond the training ranges")
+    for row in table.rows[1:]:
+        shown = dict(zip(table.head, row, strict=True))
+        dashes = [shown[name] == "-" for name in ("reward per step", "reward above as_trained")]
+        assert dashes == [row[0] == "slower"] * 2
+        assert shown["success above as_trained (points)"] != "-"
+
+
+def option(flag: str) -> Any:
+    """The default of an option of the environment."""
+    value: Any = EnvConfig()
+    for name in flag.split(".")[1:]:
+        value = getattr(value, name)
+    return value
+
+
+@pytest.mark.parametrize("task", ["ball", "wall", "arch"])
+def test_edges_are_within_the_training_ranges_and_the_others_beyond(task: str) -> None:
+    for name, flags in conditions(SCALES["small"](), task).items():
+        ranges = {
+            flag: (value, option(flag)) for flag, value in flags.items() if isinstance(value, list)
+        }
+        within = [low <= a <= b <= high for (a, b), (low, high) in ranges.values()]
+        assert (name in _EDGES[task] or name == "as_trained") == (
+            all(within) and len(within) == len(flags)
+        )
 
 
 def generalised(**options: Any) -> list[Cell]:
@@ -146,7 +199,6 @@ def test_only_chosen_conditions_and_their_reference_are_played() -> None:
 
 def test_the_report_has_the_parts_of_a_sequence() -> None:
     found = report("generalise", 1.0)
-    assert [line for line in found.findings if line.startswith("sequence: parts won in")]
     table = next(
         p for p in found.sections if isinstance(p, Table) and p.title.startswith("sequence")
     )
@@ -161,12 +213,12 @@ def test_multitask_names_the_models_that_were_not_trained() -> None:
         config = replace(small, train=replace(small.train, policies=policies))
         return str(EXPERIMENTS["multitask"].report(config, records("multitask", 1.0)).sections[0])
 
-    assert words({}).startswith("Every model was trained for 3000 gradient steps: the one on")
+    assert words({}).startswith("Every model was trained for equally many epochs, as in the paper:")
     some = words({"ball": "policy", "all": "me/model"})
     assert some.startswith("Every model except those given for ball, all (`--train.policies`) was")
 
 
-def test_variance_compares_single_terms_with_their_mean() -> None:
+def test_variance_compares_single_terms_with_the_planner() -> None:
     def term(reward: float, successes: int) -> Mapping[str, Any]:
         success = [k < successes for k in range(20)]
         return {"reward": [10 * reward] * 20, "steps": [10] * 20, "success": success}
@@ -174,18 +226,61 @@ def test_variance_compares_single_terms_with_their_mean() -> None:
     figures = {
         "task": "ball",
         "horizon": 4,
-        "terms": {"mean": term(0.2, 18), "first": term(0.1, 9), "last": term(0.3, 20)},
+        "terms": {"first": term(0.1, 9), "last": term(0.3, 20)},
         "return_std": 0.5,
         "spread": [0.05, 0.1, 0.15, 0.2],
     }
-    found = EXPERIMENTS["variance"].report(
-        SCALES["small"](), {"plan_terms-ball": {"figures": figures}}
+    cells = {c.name: c for c in EXPERIMENTS["variance"].cells(SCALES["small"]())}
+    found = {
+        "plan_terms-ball": {"figures": figures},
+        **{name: {"figures": played(cells[name])} for name in _HORIZON_CELLS},
+    }
+    for name, played_term in zip(_HORIZON_CELLS, (term(0.05, 8), term(0.2, 18)), strict=True):
+        row = found[name]["figures"]["ball"]["planner"]["played"]
+        row |= played_term
+    assert cells["plan_terms-ball"].flags["seed"] == cells[_HORIZON_CELLS[0]].flags["seed"]
+    made = EXPERIMENTS["variance"].report(SCALES["small"](), found)
+    spread, line = made.findings
+    assert "0.10, 0.20, 0.30, 0.40 of" in spread
+    assert line == (
+        "ball: compared with the planner (90.0 %), by reward: one step worse (40.0 %), first term "
+        "worse (45.0 %), last term better (100.0 %)"
     )
-    (line,) = found.findings
-    assert line.startswith("ball: compared with the mean of Q over a plan (90.0%), by reward: ")
-    assert "first term worse (45.0%), last term better (100.0%)" in line
-    assert "0.10, 0.20, 0.30, 0.40 of" in line
-    assert found.figures["ball"]["terms"]["last"]["success_rate"] == 1.0
+    assert made.figures["ball"]["terms"]["last term"]["success_rate"] == 1.0
+    alone = EXPERIMENTS["variance"].report(
+        SCALES["small"](), {"plan_terms-ball": found["plan_terms-ball"]}
+    )
+    assert len(alone.findings) == 1
+
+
+def test_variance_compares_its_prediction_with_the_same_model_in_closed_loop() -> None:
+    found = records("variance", 1.0)
+    errors = np.random.default_rng(0).normal(size=(100, 6))  # independent
+    returns = np.zeros((100, 6, 2))
+    plans = {"planner": analysis(errors, returns, returns)}
+    found["residuals-ball"] = {"figures": {"plans": plans}}
+    for name, reward in (("ours_mc_n1", 0.1), ("ours_mc", 0.2)):
+        row = found[f"play-ball-{name}-s0"]["figures"]["ball"]["planner"]["played"]
+        row["reward"] = [10 * reward] * 20
+    cells = {c.name: c for c in EXPERIMENTS["variance"].cells(SCALES["small"]())}
+    model = CellOutput("train-all-mc-s0", ARTIFACT)
+    for name in ("residuals-ball", "play-ball-ours_mc_n1-s0", "play-ball-ours_mc-s0"):
+        assert cells[name].flags["policy.path"] == model
+    assert cells["plan_terms-ball"].flags["policy.path"] != model
+    correlation, prediction, best = EXPERIMENTS["variance"].report(SCALES["small"](), found).lead
+    assert "ball: correlation " in correlation
+    assert prediction.endswith("ball N = 4, confirmed.")
+    assert best.startswith("The default model earns the most reward at N = ")
+
+
+def test_a_share_of_no_variance_is_a_dash() -> None:
+    errors = np.random.default_rng(0).normal(size=(50, 6))
+    errors[:, 0] = 0.0
+    returns = np.random.default_rng(1).normal(size=(50, 6, 4))
+    plans = {"planner": analysis(errors + returns.mean(2), returns, returns)}
+    found = {"residuals-ball": {"figures": {"plans": plans}}}
+    made = EXPERIMENTS["variance"].report(SCALES["small"](), found)
+    assert made.lead[0].endswith("), -.")
 
 
 @pytest.mark.parametrize(
@@ -206,8 +301,79 @@ def test_intervals_decide_whether_hands_are_raised(
     found = EXPERIMENTS["interpret"].report(
         SCALES["small"](), {"behaviour-ball": {"figures": figures}}
     )
-    (line,) = found.findings
-    assert line.endswith(f"after a throw: {words}")
+    (line,) = found.lead
+    assert line.endswith(f"after a throw ({words}).")
+
+
+def test_bracing_is_compared_with_the_autoregressive_model() -> None:
+    def figures(contact: float, gain: float) -> Mapping[str, Any]:
+        def row(name: str, value: float) -> Mapping[str, Any]:
+            return {name: value, "ci95": [value - 0.01, value + 0.01], "episodes": 20}
+
+        shares = ("undisturbed_without_contact", "hands_back")
+        return {
+            **{name: row("share", 0.9) for name in shares},
+            "hand_contact": row("share", contact),
+            "contact_s": row("mean", 0.4),
+            "bracing_q": row("mean", gain),
+            "bracing_j": row("mean", gain - 0.1),
+        }
+
+    config = SCALES["small"]()
+    cells = {c.name: c for c in EXPERIMENTS["interpret"].cells(config)}
+    arwm = cells["behaviour-wall-arwm"].flags
+    assert arwm["policy.path"] == CellOutput("train-all-arwm-s0", ARTIFACT)
+    assert {**cells["behaviour-wall"].flags, "policy.path": arwm["policy.path"]} == arwm
+    found = {
+        "behaviour-wall": {"figures": figures(0.98, 0.5)},
+        "behaviour-wall-arwm": {"figures": figures(0.1, -0.5)},
+    }
+    made = EXPERIMENTS["interpret"].report(config, found)
+    assert len(made.lead) == 1
+    ours, other = made.findings
+    assert ours.startswith("wall: a hand touches the wall after 98.0 % of the pushes; Q prefers ")
+    assert "+0.40 with the costs" in ours
+    assert other.startswith("wall, ARWM: a hand touches the wall after 10.0 %")
+    assert "Q does not prefer " in other
+    given = replace(config, train=replace(config.train, policies={"all": "contact"}))
+    assert "behaviour-wall-arwm" not in {c.name for c in EXPERIMENTS["interpret"].cells(given)}
+
+
+def test_open_loop_errors_of_all_pixels_lead() -> None:
+    row = {"model": 0.1, "repeat": 0.2, "model_moving": 0.3, "repeat_moving": 0.9}
+    image = np.ones((len(HORIZONS), 2, 2)).tolist()
+    strips = [{"seen": image, "imagined": image}]
+    figures = {"episodes": 3, "errors_m": {str(k): row for k in HORIZONS}, "strips": strips}
+    found = {f"open_loop-{task}": {"figures": figures} for task in ("ball", "arch")}
+    made = EXPERIMENTS["interpret"].report(SCALES["small"](), found)
+    assert made.lead[0].endswith("is 10.0 cm of ball (20.0 cm), 10.0 cm of arch (20.0 cm).")
+    assert made.figure is not None
+    assert made.figure.name == "open-loop-ball"
+    assert [part.name for part in made.sections if isinstance(part, Plot)] == ["open-loop-arch"]
+
+
+def test_a_value_map_has_a_frame_around_what_can_be_reached() -> None:
+    shown = {
+        "moment": "before",
+        "tick": 3,
+        "hand": "left",
+        "best": (0.2, 0.1),
+        "reach": ([0.1, 0.3], [0.0, 0.2]),
+        "values": [[0.0, 1.0], [2.0, 3.0]],
+    }
+    summary = {"episodes": 2, "spread": 0.5, "height_error_m": 0.1}
+    figures = {
+        "summary": {"before": summary, "75%": summary},
+        "x": [0.0, 0.4],
+        "z": [0.0, 0.4],
+        "aim": [0.1, 0.3],
+        "maps": [shown],
+    }
+    found = {"value_maps-ball": {"figures": figures}}
+    made = EXPERIMENTS["interpret"].report(SCALES["small"](), found)
+    assert made.figure is not None
+    assert "what the rate limit can reach" in made.figure.caption
+    assert len(made.lead) == 1
 
 
 def test_the_cells_of_a_value_map_are_around_their_centres() -> None:
@@ -215,13 +381,13 @@ def test_the_cells_of_a_value_map_are_around_their_centres() -> None:
 
 
 def test_ablations_name_the_best_choice() -> None:
-    def record(r2: float) -> Mapping[str, Any]:
-        errors = {str(k): {"model_mm": 1.0, "repeat_mm": 4.0} for k in (4, 8)}
+    def record(gain: float) -> Mapping[str, Any]:
+        errors = {str(k): {"model_mm": 1.0, "repeat_mm": gain} for k in (4, 8)}
         heldout = {
             "depth": dict.fromkeys(("moving", "near", "valid"), errors),
             "state": {"joint_position": {"4": {"model": 2.0, "repeat": 3.0}}},
             "termination": {"5": {"auc": None}},
-            "value": {"r2": r2, "slope": 1.0},
+            "value": {"r2": 0.3, "slope": 1.0},
             "latent": {"active": 20, "kl_nats": 3.0},
         }
         return {"figures": {"tasks": {"ball": heldout}}}
@@ -229,17 +395,20 @@ def test_ablations_name_the_best_choice() -> None:
     config = replace(SCALES["small"](), tasks=("ball",))
     config = replace(config, train=replace(config.train, seeds=(0, 1)))
     found = {
-        "ablate-ball-default-s0": record(0.2),
-        "ablate-ball-default-s1": record(0.4),
-        "ablate-ball-td-s1": record(0.5),
+        "train-ball-default-s0": record(2.0),
+        "train-ball-default-s1": record(4.0),
+        "ablate-ball-value_two_hot-s1": record(5.0),
     }
     made = EXPERIMENTS["ablations"].report(config, found)
-    assert made.findings[-1] == "ball, Q R2: `td` is best with 0.5; `default` has 0.3, place 2 of 2"
+    words = "`value_two_hot` is best with 5; `default` has 3, place 2 of 2."
+    assert made.lead == [f"ball, moving, 8 (x): {words}"]
+    assert made.findings == [f"ball, all pixels, 8 (x): {words}"]
+    assert made.figure is not None
     (table,) = (part for part in made.sections if isinstance(part, Table))
     rows = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
-    assert rows["default"]["Q R2"] == "0.3 ± 0.1"
-    assert rows["default"]["moving, 8 (x)"] == "4 ± 0"
-    assert rows["td"]["AUC within 5"] == "-"
+    assert rows["default"]["Q R2"] == "0.3 ± 0"
+    assert rows["default"]["moving, 8 (x)"] == "3 ± 1"
+    assert rows["value_two_hot"]["AUC within 5"] == "-"
 
 
 def test_searches_above_the_time_budget_are_named() -> None:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from egovcp.artifact import save_artifact
+from egovcp.errors import UsageError
 from egovcp.eval_scores import Gain
+from egovcp.model import PRESETS, WorldModel
+from egovcp.plan.config import PlannerConfig
 from egovcp_experiment.cell import ARTIFACT, PLAY, TRAIN, Cell, CellOutput
 from egovcp_experiment.config import SCALES, ExperimentConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
@@ -34,27 +39,23 @@ def planned(name: str) -> tuple[object, object]:
 
 def test_rows_set_objective_and_horizon() -> None:
     assert [planned(f"ours_n{n}") for n in range(1, 7)] == [("value", n) for n in range(1, 7)]
-    assert planned("arwm") == ("value", 4)
+    assert planned("arwm") == planned("ours_mc") == planned("no_multistep") == ("value", 4)
     assert planned("rew_mpc") == ("reward", 4)
     assert planned("td_mpc") == planned("td_mpc_td") == ("td", 4)
 
 
 def test_rows_share_models() -> None:
-    ours = CellOutput("train-all-reward-s1", ARTIFACT)
+    ours = CellOutput("train-all-default-s1", ARTIFACT)
     for name in (*(f"ours_n{n}" for n in range(1, 7)), "rew_mpc", "td_mpc"):
         assert row(name, 1).flags["policy.path"] == ours
-    assert row("arwm", 1).flags["policy.path"] == CellOutput("train-all-reward_arwm-s1", ARTIFACT)
-    assert row("td_mpc_td", 1).flags["policy.path"] == CellOutput(
-        "train-all-reward_td-s1", ARTIFACT
-    )
-    assert sum(cell.command is TRAIN for cell in CELLS.values()) == 3 * len(SEEDS)
+    for name, model in (("arwm", "arwm"), ("td_mpc_td", "td"), ("ours_mc", "mc")):
+        assert row(name, 1).flags["policy.path"] == CellOutput(f"train-all-{model}-s1", ARTIFACT)
+    assert sum(cell.command is TRAIN for cell in CELLS.values()) == 5 * len(SEEDS)
 
 
 def test_models_differ_in_one_flag() -> None:
-    joint, arwm, td = (
-        CELLS[f"train-all-{name}-s0"].flags for name in ("reward", "reward_arwm", "reward_td")
-    )
-    assert joint["policy.loss.reward"] == 1
+    joint, arwm, td = (CELLS[f"train-all-{name}-s0"].flags for name in ("default", "arwm", "td"))
+    assert joint["policy.loss.reward"] == "1"
     assert joint["steps"] == 700
     assert arwm == {**joint, "policy.dynamics": "autoregressive"}
     assert td == {**joint, "policy.loss.q_target": "td"}
@@ -62,17 +63,32 @@ def test_models_differ_in_one_flag() -> None:
 
 def test_all_rows_and_references_play_the_same_scenarios() -> None:
     plays = [c for c in CELLS.values() if c.command is PLAY and c.flags["task"] == "ball"]
-    assert len(plays) == 10 * len(SEEDS) + 1
-    assert {(c.flags["episodes"], c.flags["seed"]) for c in plays} == {(100, 2)}
+    assert len(plays) == 12 * len(SEEDS) + 1
+    assert {(c.flags["episodes"], c.flags["seed"]) for c in plays} == {(100, 20)}
 
 
 def test_a_smoke_run_has_each_of_the_models() -> None:
     cells = TABLE1.cells(replace(SCALES["smoke"](), tasks=("ball",)))
     assert [c.name for c in cells if c.command is TRAIN] == [
-        "train-ball-reward-s0",
-        "train-ball-reward_arwm-s0",
-        "train-ball-reward_td-s0",
+        "train-ball-default-s0",
+        "train-ball-arwm-s0",
+        "train-ball-td-s0",
     ]
+
+
+def test_a_model_without_a_reward_head_is_refused_if_rows_plan_with_rewards(
+    tmp_path: Path,
+) -> None:
+    policy = tmp_path / "policy"
+    model = WorldModel(PRESETS["debug"])
+    save_artifact(policy, model, PlannerConfig(), {"controller_id": "servo-1"})
+    given = replace(CONFIG, train=replace(CONFIG.train, policies={"all": str(policy)}))
+    with pytest.raises(UsageError, match=r"--train\.policies: row rew_mpc"):
+        TABLE1.cells(given)
+    assert TABLE1.cells(replace(given, only=("ours_n4",)))
+    assert TABLE1.cells(replace(CONFIG, train=replace(CONFIG.train, policies={"all": "a/hub"})))
+    with pytest.raises(UsageError, match=r"--train\.flags: row td_mpc_td"):
+        TABLE1.cells(replace(CONFIG, train=replace(CONFIG.train, flags=("--batch_size=32",))))
 
 
 def record(task: str, reward: float, success: float, rng: np.random.Generator) -> Mapping[str, Any]:
@@ -82,6 +98,7 @@ def record(task: str, reward: float, success: float, rng: np.random.Generator) -
         "steps": [10] * COUNT,
         "reward": (10 * reward + rng.normal(0, 0.05, COUNT)).tolist(),
         "success": [k < success * COUNT for k in range(COUNT)],
+        "terms": {"hit": [-1.0] * COUNT, "pose": [0.5] * COUNT},
     }
     return {"figures": {task: {"planner": {"played": played, "plan_ms_p50": 1.0}}}}
 
@@ -125,11 +142,32 @@ def test_the_papers_ordering_is_recognised() -> None:
         ("ours_n4", "td_mpc_td", "ball", "holds"),
         ("td_mpc_td", "ours_n4", "wall", "holds"),
     }
-    assert found.findings[0].startswith("of 9 claims, one for each task: 9 holds (")
-    assert "the most reward at N=4" in found.findings[-1]
-    assert any(
-        line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.findings
-    )
+    assert found.lead == [
+        "Ours (N = 4) blocks 70.0 % of the balls and braces in 60.0 % of the pushes.",
+        "Of the paper's 9 claims 9 hold.",
+        "Of the horizons the most reward is earned by N = 4 (ball) and N = 4 (wall).",
+    ]
+    assert "about 0.2 of the 9 claims would hold" in found.findings[0]
+
+
+def test_the_figure_needs_the_references() -> None:
+    cells = results(as_in_the_paper)
+    assert TABLE1.report(CONFIG, cells).figure is None
+    rng = np.random.default_rng(0)
+    bounds: dict[str, Any] = {}
+    for name, level in (("hold", 0.0), ("random", 0.0), ("oracle", 0.3)):
+        bounds[name] = record("ball", level, 0.5, rng)["figures"]["ball"]["planner"]
+    figure = TABLE1.report(CONFIG, cells | {"bounds-ball": {"figures": {"ball": bounds}}}).figure
+    assert figure is not None
+    assert "ours, N=4 above ARWM: ball" in figure.svg
+    assert "wall" not in figure.svg
+
+
+def test_the_terms_of_the_reward_are_listed() -> None:
+    tables = [p for p in report(as_in_the_paper).sections if isinstance(p, Table)]
+    (terms,) = [table for table in tables if table.title == "ball: reward per step by term"]
+    assert terms.head == ("", "hit", "pose")
+    assert ("ARWM", "-0.10000", "+0.05000") in terms.rows
 
 
 def test_the_opposite_is_contradicted_and_equality_is_undecided() -> None:
@@ -142,7 +180,10 @@ def test_the_opposite_is_contradicted_and_equality_is_undecided() -> None:
 def test_a_claim_that_fails_in_one_training_holds_on_average_only() -> None:
     found = report(lambda task, variant, seed: (0.3, -0.1)[seed] if variant == "ours_n4" else 0.0)
     assert ("ours_n4", "ours_n1", "ball", "holds on average only") in words(found)
-    assert "in 1 of 2 trainings" in " ".join(found.findings)
+    found = report(lambda task, variant, seed: (0.1, -0.3)[seed] if variant == "ours_n4" else 0.0)
+    assert ("ours_n4", "ours_n1", "ball", "contradicted on average only") in words(found)
+    claims = [part for part in found.sections if isinstance(part, Table)][1]
+    assert claims.rows[0][6] == "1 of 2"
 
 
 def test_the_summary_marks_the_best_and_has_the_deviation_of_trainings() -> None:
@@ -166,16 +207,23 @@ def test_a_claim_uses_the_trainings_of_both_rows() -> None:
     rows = {"a": ["a0", "a1"], "b": ["b0", "b1"]}
     verdict = judge(claim, "ball", rows, records)
     assert verdict is not None
-    assert (verdict.seeds, verdict.word, verdict.gain.success) == (1, "undecided", 0.0)
+    assert (len(verdict.differences), verdict.word, verdict.gain.success) == (1, "undecided", 0.0)
+    assert verdict.over_trainings is None
     assert judge(claim, "ball", {"a": ["a1"], "b": ["b1"]}, records) is None
 
 
+GAIN = Gain(1.0, (0.5, 1.5), 0.0, (0.0, 0.0))
+
+
 def test_verdicts_are_counted() -> None:
-    claim = Claim("a", "b", ("ball",))
-    gain = Gain(1.0, (0.5, 1.5), 0.0, (0.0, 0.0))
-    up = Verdict(claim, "ball", gain, agreeing=1, seeds=1)
-    even = replace(up, gain=gain._replace(reward_interval=(-0.1, 0.1)))
-    assert count_verdicts([up] * 3 + [even] * 17).startswith(
-        "of 20 claims, one for each task: 3 holds, 17 undecided (95 % intervals; were no two "
-        "rows any different, about 0.5 would"
+    up = Verdict(Claim("a", "b", ("ball",)), "ball", GAIN, (1.0,))
+    even = replace(up, gain=GAIN._replace(reward_interval=(-0.1, 0.1)))
+    assert count_verdicts([up] * 3 + [even] * 17) == "3 hold and 17 are undecided"
+    assert count_verdicts([up, even, replace(up, differences=(-1.0, 2.0))]) == (
+        "1 holds, 1 holds on average only and 1 is undecided"
     )
+
+
+def test_the_interval_over_trainings_is_students() -> None:
+    verdict = Verdict(Claim("a", "b", ("ball",)), "ball", GAIN, (0.1, 0.2, 0.3))
+    assert verdict.over_trainings == pytest.approx((0.2, 4.303 * 0.1 / np.sqrt(3)))

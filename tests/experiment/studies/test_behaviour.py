@@ -45,6 +45,15 @@ def test_episodes_without_recovery_are_not_judged() -> None:
     assert [t.hands_back for t in (never_slow, too_short, fallen)] == [None, None, None]
 
 
+def test_the_time_to_contact_counts_from_the_push() -> None:
+    trace = track([0.0] * 5, [0.0] * 5)
+    assert trace.since[0] < 0
+    trace.hands_on = [True, False, False, True, True]
+    assert trace.contact_s == pytest.approx(3 * TICK)  # to the end of the third tick
+    trace.hands_on = [True, *[False] * 4]
+    assert trace.contact_s is None
+
+
 @pytest.mark.parametrize(
     ("task", "key"),
     [
@@ -59,6 +68,11 @@ def test_every_task_is_measured(task: str, key: str, flags: list[str], tmp_path:
     assert found["task"] == task
     assert found[key]["episodes"] >= 2
     assert 0 < found[key]["mean"] < 1
+    if task == "wall":
+        assert found["hand_contact"]["episodes"] == found["pushed"]
+        costs = found["bracing_q"]["mean"] - found["bracing_j"]["mean"]
+        assert found["bracing_q"]["episodes"] == found["pushed"]
+        assert costs > 0
 
 
 @pytest.mark.slow

@@ -105,6 +105,11 @@ def test_the_study_measures_both_kinds_of_plans(flags: list[str], tmp_path: Path
         assert [at["n"] for at in row["horizons"]] == list(range(1, STEPS + 1))
 
 
+@pytest.fixture(autouse=True)
+def _few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("egovcp.eval_scores._RESAMPLES", 200)
+
+
 def plans(
     rho: float, noise: float, bias: float = 0.0, count: int = 4000
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,6 +140,25 @@ def test_the_variance_of_a_mean_lies_between_its_bounds(rho: float) -> None:
         assert at["v_lb"] <= at["variance"] * 1.001
         assert at["variance"] <= at["v_ub"] * 1.001
         assert at["error"] == pytest.approx(at["variance"] + at["bias"] ** 2)
+
+
+def test_the_remaining_share_has_an_interval_over_plans() -> None:
+    found = analysis(*plans(0.3, noise=1.0))
+    low, high = found["share_4_ci95"]
+    assert low < found["share_4"] < high
+    assert low < 0.25 * (1 + 3 * 0.3) < high
+    assert found["rho_next_ci95"][0] < 0.3 < found["rho_next_ci95"][1]
+
+
+def test_a_share_of_a_variance_that_may_be_zero_is_unknown() -> None:
+    value, returns, whole = plans(0.0, noise=4.0, count=100)
+    value = returns.mean(2) + 0.1 * np.random.default_rng(1).normal(size=value.shape)
+    found = analysis(value, returns, whole)
+    assert found["share_4"] is None
+    assert found["share_4_ci95"] is None
+    value, returns, whole = plans(0.0, noise=0.0, count=100)
+    value[:, 0] = returns[:, 0].mean(1) + 1e-5 * value[:, 0]
+    assert analysis(value, returns, whole)["share_4"] is None
 
 
 def test_the_bounds_are_those_of_the_paper() -> None:

@@ -23,3 +23,7 @@ def test_value_maps_are_taken_once_at_every_moment(flags: list[str], tmp_path: P
     x, z = shown["best"]
     best = np.array(shown["values"])[found["z"].index(z), found["x"].index(x)]
     assert best == np.max(shown["values"])
+    for shown in found["maps"]:
+        for (low, high), ends in zip(shown["reach"], (found["x"], found["z"]), strict=True):
+            assert ends[0] - 1e-6 <= low < high <= ends[-1] + 1e-6
+            assert high - low < 0.5 * (ends[-1] - ends[0])
