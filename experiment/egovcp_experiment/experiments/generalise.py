@@ -285,11 +285,8 @@ def _conclusions(found: Mapping[str, Scores], verdicts: Mapping[tuple[str, str],
         scenes = "scenes as trained" if base == TRAINED else f"episodes of `{base}`"
         line = f"{task}: {percent(first.success_rate)} of {scenes}"
         for word in _WORDS[1:]:
-            own = [
-                name
-                for name in planner
-                if verdicts[task, name] == word and (word == _WORDS[1] or name in _EDGES.get(task, ()))
-            ]
+            shown_names = planner if word == _WORDS[1] else _EDGES.get(task, ())
+            own = [n for n in planner if verdicts[task, n] == word and n in shown_names]
             if own:
                 shown = ", ".join(f"`{name}` {_points(found, (task, name)):+.0f}" for name in own)
                 line += f"; {word}: {shown}"

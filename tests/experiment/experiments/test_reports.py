@@ -127,7 +127,8 @@ def test_a_verdict_needs_the_whole_interval_on_one_side_of_the_bar(lost: int) ->
     assert verdicts.pop("as_trained") == ""
     assert verdicts.pop("thickest") == words[lost]
     assert set(verdicts.values()) == {words[0]}
-    assert f"the worst is `thickest` of arch ({-100 * lost / 120:+.0f} points)" in made.lead[0] or not lost
+    worst = f"the worst is `thickest` of arch ({-100 * lost / 120:+.0f} points)"
+    assert worst in made.lead[0] or not lost
 
 
 def test_rewards_of_longer_episodes_are_not_compared() -> None:
