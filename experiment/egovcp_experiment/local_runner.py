@@ -44,8 +44,9 @@ def commit() -> str:
         return done.stdout.strip() if done.returncode == 0 else ""
 
     try:
-        known = git("ls-files", Path(__file__).name)  # not so in a virtual environment
-        return git("describe", "--always", "--exclude=*", "--dirty=+") if known else ""
+        if not git("ls-files", Path(__file__).name):  # in a virtual environment
+            return ""
+        return git("rev-parse", "HEAD")[:12] + "+" * bool(git("diff", "HEAD"))
     except OSError:  # no git
         return ""
 
