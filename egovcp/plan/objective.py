@@ -36,9 +36,13 @@ class PlanEvaluator[C](Protocol):
 class Dynamics[L](Protocol):
     """The part of a world model that planning uses; leading dimensions (E, M) broadcast.
 
-    The objectives with rewards also need its ``discount`` and ``reward``, latent=sample its
-    ``imagine_sample``.
+    The objectives with rewards also need its ``reward``, latent=sample its ``imagine_sample``.
     """
+
+    @property
+    def discount(self) -> Tensor:
+        """Discount per step of Q."""
+        ...
 
     @property
     def min_return(self) -> Tensor:

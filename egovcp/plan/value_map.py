@@ -10,7 +10,7 @@ costs of poses and action changes.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -72,9 +72,8 @@ def value_map[L](
 def held_value[L](model: Dynamics[L], carry: L, actions: Tensor, planner: PlannerConfig) -> Tensor:
     """J (E, M) of actions (E, M, 7), return units: Q minus the planner's cost of holding that pose,
     without the cost of changing to it."""
-    known: Any = model  # its discount is no part of `Dynamics`
     held = replace(planner, action_rate_cost=0.0)
-    costs = action_costs(actions[:, 0, None], actions[..., None, :], held, known.discount)
+    costs = action_costs(actions[:, 0, None], actions[..., None, :], held, model.discount)
     return model.value(model.expand_candidates(carry), actions) - costs
 
 

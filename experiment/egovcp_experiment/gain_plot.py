@@ -48,4 +48,4 @@ def gain_plot(
             axes.set_xlabel(label)
 
     rows = max(map(len, panels.values()))
-    return draw(name, caption, paint, (3.2 * len(panels), 0.9 + 0.2 * rows))
+    return draw(name, caption, paint, (max(8.0, 3.2 * len(panels)), 0.9 + 0.2 * rows))

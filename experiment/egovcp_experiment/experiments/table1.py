@@ -20,12 +20,12 @@ from egovcp.hub import is_local_path
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.gain_plot import Difference, gain_plot
 from egovcp_experiment.grid import DEFAULT, REFERENCES, Grid, Model, parse_flags
 from egovcp_experiment.report import (
     ExperimentReport,
     Plot,
     Table,
-    draw,
     listed,
     number,
     percent,
@@ -356,26 +356,20 @@ def _forest(
         if {"oracle", "hold"} <= found.keys()
         and found["oracle"].reward_per_step != found["hold"].reward_per_step
     }
-    shown = [verdict for verdict in verdicts if verdict.task in scale]
+    shown: dict[str, Difference] = {}
+    for v in verdicts:
+        if v.task in scale:
+            low, high = (scale[v.task] * end for end in v.gain.reward_interval)
+            difference = Difference(scale[v.task] * v.gain.reward, (low, high), _COLOURS[v.word])
+            shown[f"{v.claim.title}: {v.task}"] = difference
     if not shown:
         return None
-
-    def paint(figure: Any) -> None:
-        axes = figure.subplots()
-        for k, v in enumerate(shown):
-            interval = scale[v.task] * np.array(v.gain.reward_interval)
-            known = v.word in [u.word for u in shown[:k]]
-            look = {"color": _COLOURS[v.word], "label": None if known else v.word}
-            axes.plot(interval, [k, k], color=_COLOURS[v.word], linewidth=1.5)
-            axes.plot([scale[v.task] * v.gain.reward], [k], "o", markersize=4, **look)
-        axes.axvline(0, color="0.7", linewidth=0.8, zorder=0)
-        axes.set_yticks(range(len(shown)), [f"{v.claim.title}: {v.task}" for v in shown])
-        axes.invert_yaxis()
-        axes.set_xlabel("difference in reward, % of that between oracle and hold")
-        axes.legend(fontsize=8)
-
-    caption = "The paper's claims: differences in reward on the same scenarios, 95 % intervals"
-    return draw("claims", caption, paint, (8.0, 0.9 + 0.25 * len(shown)))
+    caption = (
+        "The paper's claims: holds (green), contradicted (red), undecided (grey); light: on "
+        "average only"
+    )
+    label = "difference in reward, % of that between oracle and hold"
+    return gain_plot("claims", caption, {"": shown}, label)
 
 
 def _summary(scores: Scores) -> Table:
