@@ -135,6 +135,11 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def checkpoint_artifact(step: int) -> str:
+    """Artifact of egovcp-train after ``step`` gradient steps, relative to the folder of the run."""
+    return f"checkpoints/{step:06d}/pretrained_model"
+
+
 def external_digest(path: str) -> str:
     """SHA-256 of an artifact, dataset or file; of a Hub repository only of its name."""
     folder = user_path(path)
@@ -173,8 +178,17 @@ def _ppo_figures(folder: Path) -> dict[str, Any]:
 
 def _ppo_digest(folder: Path) -> str:
     """Of the policies of all checkpoints."""
+    return _digest_of_checkpoints(folder, lambda checkpoint: sha256(checkpoint / PPO_POLICY))
+
+
+def _train_digest(folder: Path) -> str:
+    """Of the policies of all checkpoints."""
+    return _digest_of_checkpoints(folder, lambda p: _artifact_digest(p / "pretrained_model"))
+
+
+def _digest_of_checkpoints(folder: Path, digest: Callable[[Path], str]) -> str:
     checkpoints = sorted(p for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
-    lines = [f"{p.name} {sha256(p / PPO_POLICY)}" for p in checkpoints]
+    lines = [f"{checkpoint.name} {digest(checkpoint)}" for checkpoint in checkpoints]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
@@ -221,7 +235,7 @@ TRAIN: Final = CellCommand(
     prog="egovcp-train",
     output="output_dir",
     figures=_train_figures,
-    digest=lambda folder: _artifact_digest(folder / ARTIFACT),
+    digest=_train_digest,
     minutes=lambda flags: 0.0095 * float(flags["steps"]),
     options="egovcp_train.config:TrainConfig",
     resume_flags=_resume_from_checkpoint,

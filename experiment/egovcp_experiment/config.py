@@ -224,6 +224,7 @@ def smoke() -> ExperimentConfig:
                 "--tensorboard=false",
                 "--device=cpu",
                 "--threads=1",
+                "--save_freq=2",
                 _REWARD_HEAD,
             ),
         ),

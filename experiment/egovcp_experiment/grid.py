@@ -25,6 +25,7 @@ from egovcp_experiment.cell import (
     CellOutput,
     ExternalPath,
     Flags,
+    checkpoint_artifact,
     read_json,
     study,
 )
@@ -46,6 +47,10 @@ class Model:
     """Part of the names of cells."""
     flags: Flags = field(default_factory=dict)
     """Changed flags of egovcp-train."""
+    step: int = 0
+    """Gradient steps after which it is played; 0: at the end."""
+    seeds: int | None = None
+    """Number of trainings, with the first seeds; None: all seeds."""
 
 
 _UNCHANGED: Final[Flags] = {}
@@ -109,10 +114,11 @@ class Grid:
     ) -> CellOutput | ExternalPath:
         """Artifact of a model trained on a task, or on `ALL`."""
         path = self.given_policy(task)
-        if path and not model.flags:
+        if path and not model.flags and not model.step:
             shipped = path in shipped_policies()
             return ExternalPath(str(policy_folder(path)) if shipped else path)
-        return CellOutput(self.train(task, seed, model).name, ARTIFACT)
+        artifact = checkpoint_artifact(model.step) if model.step else ARTIFACT
+        return CellOutput(self.train(task, seed, model).name, artifact)
 
     def train(self, task: str, seed: int, model: Model, name: str = "") -> Cell:
         """A training, whose metrics are those on held-out episodes."""
@@ -133,7 +139,7 @@ class Grid:
         model: Model = _DEFAULT_MODEL,
         trained_on: str = "",
     ) -> list[str]:
-        """Names of the cells of the planner in closed loop, one per training seed.
+        """Names of the cells of the planner in closed loop, one per training.
 
         Args:
             variant: part of the names, unless no flag is changed.
@@ -141,9 +147,9 @@ class Grid:
             trained_on: task of the model; empty: all tasks.
         """
         trained_on = trained_on or self.trained_on
-        changed = flags or model.flags or trained_on != self.trained_on
+        changed = flags or model.flags or model.step or trained_on != self.trained_on
         names = []
-        for seed in self.config.train.seeds:
+        for seed in self.config.train.seeds[: model.seeds]:
             policy = {"controllers": "planner", "policy.path": self.model(trained_on, seed, model)}
             name = f"play-{task}-{variant if changed else DEFAULT}-s{seed}"
             self.add(Cell(name, PLAY, {**self.scenarios(task), **policy, **flags}))

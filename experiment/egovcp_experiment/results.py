@@ -116,41 +116,48 @@ _QUANTITIES: Final[Mapping[str, Callable[[EvalScores], tuple[float, float, float
 
 @dataclass(frozen=True)
 class Curve:
-    """Scores of one learner along its transitions."""
+    """Scores of one learner against a number of transitions or of gradient steps."""
 
     label: str
     points: Mapping[int, EvalScores]
-    """Transitions -> scores."""
+    """Number -> scores."""
     colour: str
     """Of Matplotlib."""
     style: str = "o-"
     """Of Matplotlib."""
 
 
-def learning_curves(name: str, caption: str, curves: Sequence[Curve]) -> Plot:
-    """Success and reward against transitions, with 95 % intervals."""
+def learning_curves(name: str, caption: str, panels: Mapping[str, Sequence[Curve]]) -> Plot:
+    """Success and reward with 95 % intervals; ``panels`` has the curves by the label of x."""
 
     def paint(figure: Any) -> None:
-        from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+        rows = figure.subplots(len(panels), 2, squeeze=False)
+        for row, (x_label, curves) in zip(rows, panels.items(), strict=True):
+            for axes, (y_label, quantity) in zip(row, _QUANTITIES.items(), strict=True):
+                for curve in curves:
+                    _paint_curve(axes, curve, quantity)
+                axes.set(xlabel=x_label, ylabel=y_label)
+            row[0].legend(fontsize=8)
 
-        left, right = figure.subplots(1, 2)
-        for axes, (label, quantity) in zip((left, right), _QUANTITIES.items(), strict=True):
-            for curve in curves:
-                xs = list(curve.points)
-                middle, low, high = zip(*map(quantity, curve.points.values()), strict=True)
-                axes.plot(xs, middle, curve.style, color=curve.colour, label=curve.label)
-                if len(xs) == 1:  # an error bar instead of a band
-                    axes.plot(xs * 2, [low[0], high[0]], color=curve.colour, linewidth=1)
-                else:
-                    axes.fill_between(xs, low, high, color=curve.colour, alpha=0.15, linewidth=0)
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # for less than a decade
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.set(xlabel="transitions", ylabel=label)
-        left.legend(fontsize=8)
+    return draw(name, f"{caption}, 95 % intervals", paint, (8.0, 3.0 * len(panels)))
 
-    return draw(name, f"{caption}, 95 % intervals", paint)
+
+def _paint_curve(
+    axes: Any, curve: Curve, quantity: Callable[[EvalScores], tuple[float, float, float]]
+) -> None:
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
+    xs = list(curve.points)
+    middle, low, high = zip(*map(quantity, curve.points.values()), strict=True)
+    axes.plot(xs, middle, curve.style, color=curve.colour, label=curve.label)
+    if len(xs) == 1:  # an error bar instead of a band
+        axes.plot(xs * 2, [low[0], high[0]], color=curve.colour, linewidth=1)
+    else:
+        axes.fill_between(xs, low, high, color=curve.colour, alpha=0.15, linewidth=0)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # for less than a decade
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _gain(errors: Mapping[str, float | None], unit: str = "") -> float | None:

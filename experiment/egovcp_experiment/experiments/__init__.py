@@ -88,7 +88,7 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     ),
     "ppo": Experiment("learning curve of PPO, compared with the planner", ppo.report),
     "sample-efficiency": Experiment(
-        "success against the transitions that a model has seen (fig. 5)",
+        "success against the transitions and gradient steps of a model (fig. 5)",
         sample_efficiency.report,
         seeds=(0, 1, 2),
     ),

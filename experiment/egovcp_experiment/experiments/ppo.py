@@ -62,9 +62,9 @@ def steps_per_episode(grid: Grid, task: str, records: results.Records) -> float:
     return float(figures["steps"] / figures["episodes"])
 
 
-def steps_text(count: int) -> str:
-    """A number of transitions in words."""
-    return f"{count / 1000:.0f}k steps" if count >= 10_000 else f"{count} steps"
+def count_text(count: int) -> str:
+    """A number, rounded to thousands if it is large: ``500k``."""
+    return f"{count / 1000:.0f}k" if count >= 10_000 else str(count)
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
@@ -102,17 +102,21 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
                 if planner is not None:
                     curves.append(results.Curve(task, {offline: planner}, f"C{k}", "o"))
         ours = {} if planner is None else {_PLANNER: planner}
-        shown = {**ours, **{f"PPO, {steps_text(n)}": s for n, s in ppo.items()}, **references}
+        shown = {
+            **ours,
+            **{f"PPO, {count_text(n)} transitions": s for n, s in ppo.items()},
+            **references,
+        }
         if shown:
             page.sections.append(results.comparison(task, shown, _PLANNER))
             page.figures.setdefault(task, {}).update(results.figures_of(shown))
     if curves:
         caption = "PPO (dashed) and the planner (dots): success and reward against transitions"
-        page.figure = results.learning_curves("transitions", caption, curves)
+        page.figure = results.learning_curves("transitions", caption, {"transitions": curves})
     if planners:
         page.lead.append(f"The planner succeeds in {_rates(planners)}.")
     if last:
-        after = steps_text(config.ppo.transitions[-1])
+        after = f"{count_text(config.ppo.transitions[-1])} transitions"
         page.lead.append(f"PPO succeeds in {_rates(last)} after {after}.")
     both = {task: _word(each, planners[task]) for task, each in last.items() if task in planners}
     if both:

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
-from typing import Any, Final
-
-import numpy as np
+from typing import Final
 
 from egovcp.artifact import policy_folder, read_options
 from egovcp.errors import UsageError
-from egovcp.eval_scores import EvalScores, Gain
+from egovcp.eval_scores import EvalScores
 from egovcp.hub import is_local_path
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.experiments.claims import WORDS, Claim, Verdict, count_verdicts, judge
 from egovcp_experiment.gain_plot import Difference, gain_plot
 from egovcp_experiment.grid import DEFAULT, REFERENCES, Grid, Model, parse_flags
 from egovcp_experiment.report import (
@@ -28,6 +26,7 @@ from egovcp_experiment.report import (
     Table,
     listed,
     number,
+    on_tasks,
     percent,
 )
 
@@ -46,101 +45,22 @@ class Row:
     """Flags of egovcp-eval."""
     paper: tuple[float, float, float] | None = None
     """The paper's mean rewards of wall, ball and arch; None: the paper has no such row."""
+    longer: int = 1
+    """How many times the gradient steps of the other rows; above 1 only with the first seed."""
+
+    def trained(self, config: ExperimentConfig) -> Model:
+        """The training of its model."""
+        flags = MODELS[self.model]
+        if self.longer == 1:
+            return Model(self.model, flags)
+        steps = self.longer * config.train.steps
+        return Model(f"{self.model}_x{self.longer}", {**flags, "steps": steps}, seeds=1)
 
     def paper_reward(self, task: str) -> float | None:
         """The paper's mean reward on a task."""
         return None if self.paper is None else self.paper[("wall", "ball", "arch").index(task)]
 
 
-@dataclass(frozen=True)
-class Claim:
-    """Row ``above`` has more reward than row ``below``."""
-
-    above: str
-    below: str
-    tasks: tuple[str, ...]
-    """Tasks for which it is claimed."""
-
-    @property
-    def title(self) -> str:
-        """In words."""
-        return f"{ROWS[self.above].title} above {ROWS[self.below].title}"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Results for a claim on one task."""
-
-    claim: Claim
-    task: str
-    gain: Gain
-    """``above`` minus ``below``."""
-    differences: tuple[float, ...]
-    """The same difference in reward per step, of each training of both."""
-
-    @property
-    def agreeing(self) -> int:
-        """Trainings in which ``above`` has more reward."""
-        return sum(difference > 0 for difference in self.differences)
-
-    @property
-    def word(self) -> str:
-        """One of `WORDS`, by the interval of the reward."""
-        holds = WORDS[0] if self.agreeing == len(self.differences) else WORDS[1]
-        contradicted = WORDS[2] if self.agreeing == 0 else WORDS[3]
-        return self.gain.word(holds, contradicted, WORDS[4])
-
-    @property
-    def over_trainings(self) -> tuple[float, float] | None:
-        """Mean of the differences and half of its 95 % interval by Student's t; None for a single
-        training."""
-        n = len(self.differences)
-        if n < 2:
-            return None
-        quantile = _T975[min(n - 1, len(_T975)) - 1]
-        half = quantile * float(np.std(self.differences, ddof=1)) / sqrt(n)
-        return float(np.mean(self.differences)), half
-
-    def figures(self) -> dict[str, Any]:
-        """For programs."""
-        return {
-            "above": self.claim.above,
-            "below": self.claim.below,
-            "task": self.task,
-            "verdict": self.word,
-            "reward_gain": self.gain.reward,
-            "reward_gain_ci95": list(self.gain.reward_interval),
-            "reward_gain_of_seeds": list(self.differences),
-            "success_gain": self.gain.success,
-            "success_gain_ci95": list(self.gain.success_interval),
-            "seeds_in_favour": self.agreeing,
-            "seeds": len(self.differences),
-        }
-
-    def row(self) -> tuple[str, ...]:
-        """In the table of claims."""
-        above, below = (
-            ROWS[name].paper_reward(self.task) for name in (self.claim.above, self.claim.below)
-        )
-        paper = None if above is None or below is None else above - below
-        spread = self.over_trainings
-        return (
-            *(self.claim.title, self.task, self.word, *self.gain.columns()),
-            "-" if spread is None else f"{spread[0]:+.5f} ± {spread[1]:.5f}",
-            f"{self.agreeing} of {len(self.differences)}",
-            number(paper, "+.4f"),
-        )
-
-
-#: 97.5 % quantiles of Student's t for 1 to 9 degrees of freedom; the last serves beyond, too.
-_T975: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-WORDS: Final = (
-    "holds",
-    "holds on average only",
-    "contradicted",
-    "contradicted on average only",
-    "undecided",
-)
 _COLOURS: Final = dict(zip(WORDS, ("C2", "#98c898", "C3", "#e8a0a0", "0.5"), strict=True))
 #: Model -> changed flags of egovcp-train.
 MODELS: Final[dict[str, Flags]] = {
@@ -177,6 +97,7 @@ ROWS: Final[dict[str, Row]] = {
     "rew_mpc": Row("Rew-MPC", DEFAULT, _plan("reward"), (0.0302, -0.0033, -0.0211)),
     "td_mpc": Row("TD-MPC, Q as in ours", DEFAULT, _plan("td"), _TD_MPC),
     "td_mpc_td": Row("TD-MPC, Q by TD", "td", _plan("td"), _TD_MPC),
+    "td_mpc_td_long": Row("TD-MPC, Q by TD, 3 x the steps", "td", _plan("td"), longer=3),
 }
 OURS: Final = "ours_n4"
 #: The paper's ordering. It has one row of TD-MPC and does not give the target of its Q.
@@ -189,6 +110,7 @@ CLAIMS: Final = (
     Claim(OURS, "td_mpc_td", ("ball", "arch")),
     Claim("td_mpc_td", OURS, ("wall",)),
 )
+_LONG: Final = "td_mpc_td_long"
 _FIRST: Final = (OURS, "arwm", "td_mpc_td")  # under --most
 _ACHIEVED: Final = {
     "ball": "blocks {} of the balls",
@@ -211,7 +133,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     _require_reward_head(grid, chosen)
     plays = {
         task: {
-            name: grid.plays(task, name, row.play, Model(row.model, MODELS[row.model]))
+            name: grid.plays(task, name, row.play, row.trained(config))
             for name, row in ROWS.items()
             if name in chosen
         }
@@ -244,6 +166,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             f"Were no two rows any different, about {0.025 * len(verdicts):.1f} of the "
             f"{len(verdicts)} claims would hold and as many be contradicted by chance."
         )
+    page.findings += _longer_training(plays, records)
     if scores:
         page.sections.append(_summary(scores))
     if verdicts:
@@ -252,7 +175,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             *("reward over trainings (95 %, t)", "trainings", "the paper's reward"),
         )
         title = "Differences, above - below, on the same scenarios"
-        page.sections.append(Table(title, head, [verdict.row() for verdict in verdicts]))
+        page.sections.append(Table(title, head, list(map(_claim_row, verdicts))))
     for task, rows in scores.items():
         titled = {ROWS[name].title: each for name, each in rows.items()}
         shown = {**titled, **references[task]}
@@ -260,6 +183,25 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         page.sections += _terms(task, plays[task], records)
         page.figures[task] = results.figures_of({**rows, **references[task]})
     return page
+
+
+def _longer_training(
+    plays: Mapping[str, Mapping[str, Sequence[str]]], records: results.Records
+) -> list[str]:
+    """How the longer training of Q by TD compares with rows of equal steps, on one seed."""
+    findings = []
+    for other in ("td_mpc_td", OURS):
+        words = {
+            task: verdict.gain.word("better", "worse", "no different beyond chance")
+            for task, cells in plays.items()
+            if (verdict := judge(Claim(_LONG, other, (task,)), task, cells, records)) is not None
+        }
+        if words:
+            findings.append(
+                f"With the first training seed and by reward, {ROWS[_LONG].title}, is "
+                f"{on_tasks(words)} than {ROWS[other].title}."
+            )
+    return findings
 
 
 def _require_reward_head(grid: Grid, rows: Iterable[str]) -> None:
@@ -279,23 +221,6 @@ def _require_reward_head(grid: Grid, rows: Iterable[str]) -> None:
             )
 
 
-def judge(
-    claim: Claim, task: str, rows: Mapping[str, Sequence[str]], records: results.Records
-) -> Verdict | None:
-    """The verdict from the trainings that both rows have; None without any.
-
-    ``rows``: row -> names of its cells, one per training seed.
-    """
-    pairs = zip(rows.get(claim.above, ()), rows.get(claim.below, ()), strict=False)
-    both = [(above, below) for above, below in pairs if above in records and below in records]
-    ours = results.eval_scores(records, [above for above, _ in both], task)
-    theirs = results.eval_scores(records, [below for _, below in both], task)
-    if ours is None or theirs is None:
-        return None
-    differences = tuple((ours.reward_of_seeds - theirs.reward_of_seeds).tolist())
-    return Verdict(claim, task, ours.gain(theirs), differences)
-
-
 def _introduction(config: ExperimentConfig) -> str:
     alone = " One training decides nothing about others." if len(config.train.seeds) == 1 else ""
     return (
@@ -304,7 +229,8 @@ def _introduction(config: ExperimentConfig) -> str:
         "plan with the same model. Q by TD is SARSA on the random walk of the data, without the "
         "critic that Q of ours is fitted to. Two rows are not the paper's, because ARWM differs "
         "from ours in more than the paper compares: `Q by returns` has the paper's own target, and "
-        f"`no multi-step losses` leaves out what the paper's model does not have.{alone}"
+        "`no multi-step losses` leaves out what the paper's model does not have. A longer training "
+        f"of Q by TD has one seed.{alone}"
     )
 
 
@@ -325,17 +251,6 @@ def _lead(verdicts: Sequence[Verdict], scores: Scores) -> list[str]:
     return lines
 
 
-def count_verdicts(verdicts: Sequence[Verdict]) -> str:
-    """Number of verdicts of each kind: ``9 hold and 1 is undecided``."""
-    words = [verdict.word for verdict in verdicts]
-    parts = []
-    for word in (w for w in WORDS if w in words):
-        count = words.count(word)
-        verb = ("is " if count == 1 else "are ") * (not word.startswith("holds"))
-        parts.append(f"{count} {verb}{word if count == 1 else word.replace('holds', 'hold')}")
-    return listed(parts)
-
-
 def _best_horizon(task: str, rows: Mapping[str, EvalScores]) -> str:
     """The best horizon on a task; empty without N = 4 and another one."""
     ours = {n: rows[f"ours_n{n}"] for n in _HORIZONS if f"ours_n{n}" in rows}
@@ -344,6 +259,25 @@ def _best_horizon(task: str, rows: Mapping[str, EvalScores]) -> str:
     best = max(ours, key=lambda n: ours[n].reward_per_step)
     beyond = best == 4 or ours[best].gain(rows[OURS]).reward_interval[0] > 0
     return f"N = {best} ({task}{'' if beyond else ', by no more than chance'})"
+
+
+def _title(claim: Claim) -> str:
+    return f"{ROWS[claim.above].title} above {ROWS[claim.below].title}"
+
+
+def _claim_row(verdict: Verdict) -> tuple[str, ...]:
+    """In the table of claims."""
+    above, below = (
+        ROWS[name].paper_reward(verdict.task) for name in (verdict.claim.above, verdict.claim.below)
+    )
+    paper = None if above is None or below is None else above - below
+    spread = verdict.over_trainings
+    return (
+        *(_title(verdict.claim), verdict.task, verdict.word, *verdict.gain.columns()),
+        "-" if spread is None else f"{spread[0]:+.5f} ± {spread[1]:.5f}",
+        f"{verdict.agreeing} of {len(verdict.differences)}",
+        number(paper, "+.4f"),
+    )
 
 
 def _forest(
@@ -361,7 +295,7 @@ def _forest(
         if v.task in scale:
             low, high = (scale[v.task] * end for end in v.gain.reward_interval)
             difference = Difference(scale[v.task] * v.gain.reward, (low, high), _COLOURS[v.word])
-            shown[f"{v.claim.title}: {v.task}"] = difference
+            shown[f"{_title(v.claim)}: {v.task}"] = difference
     if not shown:
         return None
     caption = (

@@ -128,7 +128,7 @@ def test_conclusions_follow_from_the_scores() -> None:
     found = PPO.report(CONFIG, results())
     assert found.lead == [
         "The planner succeeds in 90.0 % of ball.",
-        "PPO succeeds in 50.0 % of ball after 1000 steps.",
+        "PPO succeeds in 50.0 % of ball after 1000 transitions.",
         "By reward, compared with the planner, PPO is worse on ball.",
     ]
     assert found.findings == [
