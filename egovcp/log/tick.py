@@ -55,7 +55,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class ValueMap:
-    """Q of the planned action with the target of one hand moved over a grid (paper, figure 7a).
+    """Value of the planned action with the target of one hand moved over a grid (paper, figure 7a).
 
     The grid lies in the hand's x-z plane of the pelvis heading frame.
     """
@@ -68,7 +68,7 @@ class ValueMap:
     z_b: NDArray[np.float32]
     """(n,) hand target, m up, ascending."""
     values: NDArray[np.float32]
-    """(n, m) Q at (z, x), return units."""
+    """(n, m) Q minus the cost of holding the pose, at (z, x), return units."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,9 @@
 """Value of the planned action with one hand moved over its x-z plane (fig. 7a).
 
-    V(z, x) = Q(h_t, z_t, a with its hand at (x, z))
+    V(z, x) = Q(h_t, z_t, a') - C(a'),  a' = a with its hand at (x, z)
 
-with a the planned action, everything else of it held; optionally minus the cost of holding it. Q
-was fitted to actions that the rate limit allows after the last one, and does not contain the known
-costs of poses and action changes.
+with a the planned action and C the planner's cost of holding a pose; Q does not contain it. Q was
+fitted to actions that the rate limit allows after the last one.
 """
 
 from __future__ import annotations
@@ -50,21 +49,17 @@ def value_map[L](
     action: Tensor,
     hand: Literal["left", "right"],
     grid: HandGrid,
-    planner: PlannerConfig | None = None,
+    planner: PlannerConfig,
 ) -> Tensor:
-    """Values (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units:
-    Q, or of a ``planner`` `held_value`."""
+    """`held_value` (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return
+    units."""
     axis_x, _, axis_z = HAND_AXES[hand]
     x = _normalised(grid.x, axis_x, action)
     z = _normalised(grid.z, axis_z, action)
     actions = action[:, None, None, :].repeat(1, len(z), len(x), 1)  # (E, n, m, 7)
     actions[..., axis_x] = x
     actions[..., axis_z] = z[:, None]
-    moved = actions.flatten(1, 2)
-    if planner is None:
-        values = model.value(model.expand_candidates(carry), moved)
-    else:
-        values = held_value(model, carry, moved, planner)
+    values = held_value(model, carry, actions.flatten(1, 2), planner)
     return values.reshape(len(action), len(z), len(x))
 
 

@@ -66,13 +66,13 @@ class CellScheduler:
     @property
     def outlook(self) -> str:
         """How many cells are left, and about how long they take: the estimates of their commands,
-        scaled by the times of complete cells of the same command."""
+        which are for one cell at a time, or scaled by the times of complete cells of a command."""
         factors = {}
         for command in dict.fromkeys(cell.command for cell in self._cells):
             done = [c for c in self._cells if c.command is command and c.name in self.records]
             estimated = sum(command.minutes(cell.flags) for cell in done)
             measured = sum(self.records[cell.name]["minutes"] for cell in done)
-            factors[command.prog] = measured / estimated if estimated else 1.0
+            factors[command.prog] = measured / estimated if estimated else float(self._jobs)
         left = [cell for cell in self._cells if cell.name not in self.records]
         if not left:
             return "all done"

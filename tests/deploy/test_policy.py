@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from egovcp.artifact import load_artifact
-from egovcp.plan.config import BackendName
+from egovcp.plan.config import BackendName, PlannerConfig
 from egovcp.spec import ACTION_BOX
 from egovcp_deploy.pilot.planner import backend_of, value_maps
 from tests.support.worlds import PointWorld
@@ -44,7 +44,7 @@ def test_each_hand_has_its_own_map_with_the_goal_as_its_best_point() -> None:
     world = PointWorld()
     goal = ACTION_BOX.to_normalised(np.array([0.3, 0.24, 0.1, 0.2, -0.24, 0.4, 0.74]))
     carry = world.start(torch.zeros(1, 7), torch.tensor(goal)[None])
-    left, right = value_maps(world, carry, np.zeros(7, np.float32))
+    left, right = value_maps(world, carry, np.zeros(7, np.float32), PlannerConfig(pose_cost=0.0))
     assert (left.hand, right.hand) == ("left", "right")
     for found, (x, y, z) in ((left, (0.3, 0.24, 0.1)), (right, (0.2, -0.24, 0.4))):
         row, column = np.unravel_index(found.values.argmax(), found.values.shape)

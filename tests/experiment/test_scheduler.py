@@ -102,9 +102,11 @@ def test_the_time_that_is_left_is_estimated(cell: MakeCell, tmp_path: Path) -> N
     store = CellStore(tmp_path / "out")
     schedule = CellScheduler(cells, store, 1, lambda line: None)
     assert schedule.outlook == "3 to go, about 6.0 h"
-    assert CellScheduler(cells, store, 2, lambda line: None).outlook == "3 to go, about 3.0 h"
+    two = CellScheduler(cells, store, 2, lambda line: None)
+    assert two.outlook == "3 to go, about 6.0 h"  # cells share the cores
     store.records["a"] = {"minutes": 30.0}
     assert schedule.outlook == "2 to go, about 60 min"
+    assert two.outlook == "2 to go, about 30 min"
     lines: list[str] = []
     run([cell("d", hours=1), cell("e", hours=1)], tmp_path / "other", say=lines.append)
     assert lines[0].endswith("d: begins; 2 to go, about 2.0 h")

@@ -33,6 +33,8 @@ class PointWorld:
     coordinate the point has fallen.
     """
 
+    discount = torch.tensor(spec.GAMMA)
+
     def __init__(self, cliff: float = np.inf, floor: float = -100.0) -> None:
         self.cliff = cliff
         self.min_return = torch.tensor(floor)

@@ -93,16 +93,16 @@ def backend_of(policy: RolloutPolicy) -> str:
 
 
 def value_maps[L](
-    model: Dynamics[L], carry: L, action: NDArray[np.floating]
+    model: Dynamics[L], carry: L, action: NDArray[np.floating], config: PlannerConfig
 ) -> tuple[ValueMap, ...]:
-    """Q of the planned ``action`` (7,) with each hand moved over its box, for one robot whose
+    """Value of the planned ``action`` (7,) with each hand moved over its box, for one robot whose
     filtered state is ``carry`` (1, ...)."""
     planned = torch.as_tensor(action, dtype=torch.float32, device=model.min_return.device)
     target = ACTION_BOX.to_metric(np.asarray(action))
     maps = []
     for hand in _HANDS:
         grid = hand_grid(hand)
-        values = value_map(model, carry, planned[None], hand, grid)[0].float().cpu().numpy()
+        values = value_map(model, carry, planned[None], hand, grid, config)[0].float().cpu().numpy()
         y = float(np.float32(target[HAND_AXES[hand][1]]))
         maps.append(ValueMap(hand, grid.x, y, grid.z, values))
     return tuple(maps)
@@ -251,7 +251,7 @@ class PlannerRunner:
         maps: tuple[ValueMap, ...] = ()
         policy = self._policy
         if isinstance(policy, Policy) and policy.model.robot.is_g1:  # of its hands
-            maps = value_maps(policy.model, policy.carry, plan.step.action[0])
+            maps = value_maps(policy.model, policy.carry, plan.step.action[0], policy.config)
         return replace(
             plan,
             reconstructed=self._imagining.reconstruct()[0],

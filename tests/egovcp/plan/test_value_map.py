@@ -16,6 +16,7 @@ from tests.support.worlds import PointWorld
 
 type Hand = Literal["left", "right"]
 HANDS: tuple[Hand, ...] = ("left", "right")
+FREE = PlannerConfig(pose_cost=0.0)
 
 
 @pytest.mark.parametrize("hand", HANDS)
@@ -26,7 +27,7 @@ def test_the_best_point_is_the_goal(hand: Hand) -> None:
     goal = ACTION_BOX.to_metric(np.zeros(7))
     goal[x], goal[z] = grid.x[7], grid.z[2]
     carry = world.start(torch.zeros(1, 7), torch.tensor(ACTION_BOX.to_normalised(goal))[None])
-    values = value_map(world, carry, torch.zeros(1, 7), hand, grid)
+    values = value_map(world, carry, torch.zeros(1, 7), hand, grid, FREE)
     assert values.shape == (1, 8, 11)
     assert np.unravel_index(int(values.argmax()), (8, 11)) == (2, 7)
 
@@ -39,7 +40,7 @@ def test_every_point_is_the_value_of_that_action(hand: Hand) -> None:
     carry = model.initial(2)
     action = torch.rand(2, 7) * 2 - 1
     grid = HandGrid(np.array([0.1, 0.3], np.float32), np.array([-0.1, 0.0, 0.4], np.float32))
-    values = value_map(model, carry, action, hand, grid)
+    values = value_map(model, carry, action, hand, grid, FREE)
     x, _, z = HAND_AXES[hand]
     for row in range(3):
         for column in range(2):
@@ -56,7 +57,7 @@ def test_the_cost_of_holding_a_pose_is_subtracted() -> None:
     model, grid = toy_model(), hand_grid("left", rows=3, columns=2)
     carry, action = model.initial(1), torch.full((1, 7), 0.5)
     config = PlannerConfig(pose_cost=0.1, action_rate_cost=7.0)
-    free = value_map(model, carry, action, "left", grid)
+    free = value_map(model, carry, action, "left", grid, FREE)
     held = value_map(model, carry, action, "left", grid, config)
     pose = (1 + 1 + 5 * 0.25) / 7  # x and z at the ends of the box
     steps = model.discount ** torch.arange(RETURN_STEPS)
