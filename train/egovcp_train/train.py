@@ -297,13 +297,10 @@ class TrainingRun:
             DataError: the model is not finite.
         """
         self.learner.require_finite()
-        metrics: dict[str, Any] = {"heldout": {}, "heldout_tasks": {}, "closed_loop": {}}
-        if self.evaluated_step == self.learner.step:
-            metrics = {
-                "heldout": self.metrics,
-                "heldout_tasks": self.tasks,
-                "closed_loop": self.closed_loop_metrics,
-            }
+        names = ("heldout", "heldout_tasks", "closed_loop")
+        measured = (self.metrics, self.tasks, self.closed_loop_metrics)
+        is_current = self.evaluated_step == self.learner.step
+        metrics = {k: v if is_current else {} for k, v in zip(names, measured, strict=True)}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(metrics)}
         state = {
             "learner": self.learner.state_dict(),
@@ -336,15 +333,10 @@ class TrainingRun:
                 lines += [title, *values]
         if self.tasks:
             lines.append(table(self.tasks))
-        return "\n".join(
-            [
-                *lines,
-                f"artifact: {artifact}",
-                f"continue: {PROG} --output_dir={self.output} --resume"
-                if stopped
-                else f"next: egovcp-eval --policy.path={artifact} --task=... --output_dir=...",
-            ]
-        )
+        next_step = f"next: egovcp-eval --policy.path={artifact} --task=... --output_dir=..."
+        if stopped:
+            next_step = f"continue: {PROG} --output_dir={self.output} --resume"
+        return "\n".join([*lines, f"artifact: {artifact}", next_step])
 
 
 def _prepare_output(config: TrainConfig) -> Path:
