@@ -45,15 +45,14 @@ if python -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
     --agent.max-iterations 20
 else
   echo "no GPU: sizes that only test this script"
+  brief=(--env.{ball,wall}_episode="{ticks: 30, event_ticks: [4, 20]}" --env.arch_episode.ticks=30)
   part planner 90 python benchmarks/planner.py --rounds 2 --samples 32 --json "$out/planner.json"
-  part collect 300 "${collect[@]}" --episodes=12 --env.ball_episode.ticks=30 \
-    --env.wall_episode.ticks=30 --env.arch_episode.ticks=30
+  part collect 300 "${collect[@]}" --episodes=12 "${brief[@]}"
   part train_step 150 python benchmarks/train_step.py --root "$out/data" --batches 2 --threads 1 \
     --rounds 1 --json "$out/train_step.json"
   part train 330 "${train[@]}" --preset=debug --steps=2 --batch_size=2 --sampling.length=9 \
     --returns.steps=6 --planner.samples=32 --planner.elites=8
-  part eval 120 "${eval[@]}" --episodes=1 --env.ball_episode.ticks=30 \
-    --env.wall_episode.ticks=30 --env.arch_episode.ticks=30
+  part eval 120 "${eval[@]}" --episodes=1 "${brief[@]}"
   part lowlevel 180 egovcp-train-lowlevel --steps=200 --robots=4 --tensorboard=false \
     --output_dir="$out/lowlevel"
 fi

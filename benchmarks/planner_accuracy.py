@@ -1,14 +1,16 @@
 """Accuracy of the planner backends on recorded states, with a trained policy.
 
 Every backend plans from states of recorded episodes, with the draws of the step-by-step float32
-reference. Metrics: the change of the first action, in normalised units ([-1, 1]), and the loss of V
-by the reference, in standard deviations of V among the candidates of a first iteration.
+reference. The planner is the policy's, with other numbers of candidates and elites and without
+mirrored plans. Metrics: the change of the first action, in normalised units ([-1, 1]), and the loss
+of V by the reference, in standard deviations of V among uniformly drawn random walks.
 `other_draws` are the same metrics of the reference itself with other random draws.
 """
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,6 @@ import torch
 from report import publish
 from torch import Tensor
 
-from egovcp import spec
 from egovcp.artifact import load_artifact
 from egovcp.data.reader import open_dataset
 from egovcp.model import Carry, WorldModel
@@ -56,28 +57,32 @@ class Trial:
         self._reference = ReferenceEvaluator(model, config)
 
     def plans(self, backend: BackendName, seed: int) -> Tensor:
-        """(S, N, 7)."""
-        evaluator = make_evaluator(self._model, PlannerConfig(backend=backend))
+        """(S, P, 7), P = `PlannerConfig.actions`."""
+        config, discount = replace(self._config, backend=backend), self._model.discount
+        evaluator = make_evaluator(self._model, config)
         parts = []
         for rows in torch.arange(len(self._executed)).split(BATCH):
             carry = self._carry.map(lambda x, rows=rows: x[rows])
-            search, rng = optimiser_of(self._config), torch.Generator().manual_seed(seed)
-            plan = make_plan(evaluator, search, carry, self._executed[rows], self._config, rng)
+            search, rng = optimiser_of(config), torch.Generator().manual_seed(seed)
+            executed = self._executed[rows]
+            plan = make_plan(evaluator, search, carry, executed, config, rng, discount=discount)
             parts.append(plan.actions)
         return torch.cat(parts)
 
     def plan_value(self, plans: Tensor) -> Tensor:
-        """V (S, n) of plans (S, n, N, 7) by the reference."""
+        """V (S, n) of plans (S, n, P, 7) by the reference."""
         parts = []
         for rows in torch.arange(len(plans)).split(BATCH):
             carry = self._carry.map(lambda x, rows=rows: x[rows])
-            parts.append(self._reference.at(carry)(plans[rows], None))
+            rng = torch.Generator().manual_seed(0)  # under latent=sample
+            parts.append(self._reference.at(carry)(plans[rows], rng))
         return torch.cat(parts)
 
     def spread(self) -> Tensor:
-        """Deviation (S,) of V among plans of the data's own process."""
+        """Standard deviation (S,) of V among uniformly drawn random walks."""
         rng = torch.Generator().manual_seed(0)
-        steps = 2 * torch.rand(1, 256, self._config.horizon, spec.ACTION_DIM, generator=rng) - 1
+        shape = (1, 256, self._config.actions, self._executed.shape[-1])
+        steps = 2 * torch.rand(shape, generator=rng) - 1
         every = steps.expand(len(self._executed), -1, -1, -1)
         return self.plan_value(random_walk(self._executed[:, None], every, self._config.eta)).std(1)
 
@@ -94,8 +99,9 @@ def main() -> None:
     p.add_argument("--samples", type=int, default=1024, help="M")
     p.add_argument("--json", type=Path, help="also write the metrics to this file")
     args = p.parse_args()
-    model = load_artifact(args.policy).world_model.requires_grad_(False)
-    config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
+    artifact = load_artifact(args.policy)
+    model = artifact.world_model.requires_grad_(False)
+    config = replace(artifact.planner, samples=args.samples, elites=min(64, args.samples // 4))
     trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
     reference = trial.plans("eager", 1)
     best, spread = trial.plan_value(reference[:, None])[:, 0], trial.spread()

@@ -122,11 +122,11 @@ class Learners:
         if side == "plain":
             return {"plain": timed(lambda: self._plain.update(self._batch))}
         fetched: list[Batch] = []
-        wait = (0.0, 0.0)
+        batch = (0.0, 0.0)
 
         def on_data() -> None:
-            nonlocal wait
-            wait = timed(lambda: fetched.append(self._next()))
+            nonlocal batch
+            batch = timed(lambda: fetched.append(self._next()))
             self._ours.update(fetched.pop(), 0.0)
 
         cases: dict[str, Callable[[], object]] = {
@@ -135,7 +135,7 @@ class Learners:
             "critic": lambda: self._with_critic.update(self._batch, CRITIC_TRAINED),
             "data": on_data,
         }
-        return {name: timed(step) for name, step in cases.items()} | {"wait": wait}
+        return {name: timed(step) for name, step in cases.items()} | {"batch": batch}
 
 
 _learners: list[Learners] = []  # of a process of `take_turns`
@@ -201,7 +201,7 @@ def metrics(turns: list[Times], name: str, frames: int) -> dict[str, object]:
         f"{name}_float32_ratio": ratio("plain", "float32"),
         f"{name}_critic_ratio": ratio("critic", "step"),
         f"{name}_data_ratio": ratio("data", "step"),
-        f"{name}_wait_share": ratio("wait", "data"),
+        f"{name}_batch_share": ratio("batch", "data"),
         f"{name}_steps_per_s": 1.0 / clock,
         f"{name}_frames_per_s": frames / clock,
         f"{name}_steps_per_cpu_s": 1.0 / cpu["data"],

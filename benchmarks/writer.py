@@ -4,7 +4,7 @@ The same frames, from arrays in memory to a complete dataset on the disk:
 
 * ``lerobot``: `LeRobotDataset.add_frame` per frame, `save_episode`, `finalize`;
 * ``writer``: `egovcp.data.DatasetWriter`;
-* ``service``: every episode encoded, sealed (flushed to the disk) and committed in shards, as
+* ``collect``: every episode encoded, staged (flushed to the disk) and committed in shards, as
   `egovcp-collect` does.
 
     python benchmarks/writer.py
@@ -75,8 +75,8 @@ def write_dataset(root: Path, episodes: Sequence[Episode]) -> None:
             out.add(episode)
 
 
-def service(root: Path, episodes: Sequence[Episode]) -> None:
-    """Sealed one by one, committed together."""
+def collect(root: Path, episodes: Sequence[Episode]) -> None:
+    """Staged one by one, committed together."""
     with open_committer(root, PROVENANCE) as committer:
         for number, episode in enumerate(episodes):
             committer.staging.put(number, encode(episode))
@@ -100,13 +100,13 @@ def main() -> None:
     args = options.parse_args()
     disable_progress_bars()  # one per episode
     episodes = [make_episode(i, args.ticks) for i in range(args.episodes)]
-    for write in (lerobot, write_dataset, service):
+    for write in (lerobot, write_dataset, collect):
         rate(write, episodes[:1])  # imports, first allocations
     found = [
-        [rate(w, episodes) for w in (lerobot, write_dataset, service)] for _ in range(args.rounds)
+        [rate(w, episodes) for w in (lerobot, write_dataset, collect)] for _ in range(args.rounds)
     ]
     metrics = {}
-    for i, name in enumerate(("lerobot", "writer", "service")):
+    for i, name in enumerate(("lerobot", "writer", "collect")):
         metrics[f"{name}_frames_per_s"] = statistics.median(row[i] for row in found)
         if i:
             metrics[f"{name}_ratio"] = statistics.median(row[i] / row[0] for row in found)

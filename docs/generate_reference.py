@@ -28,10 +28,12 @@ MODULES = (
 
 
 def help_of(command: EntryPoint) -> str:
-    """The complete help of a command."""
-    output = io.StringIO()
-    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(io.StringIO()):
-        command.load()(["--help=all"])
+    """The complete help of a command; raises `SystemExit` if it fails."""
+    output, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        code = command.load()(["--help=all"])
+    if code:
+        raise SystemExit(f"{command.name} --help=all failed: {errors.getvalue()}")
     return output.getvalue()
 
 

@@ -296,7 +296,8 @@ def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
         found = "not a folder" if os.path.lexists(folder) else "no such folder"
         raise ArtifactError(
             f"{found}: {path!r}; expected a policy folder with {CONFIG}, {WEIGHTS} and "
-            f"{MANIFEST} (a run's {_IN_RUN}), a Hub id 'user/name'"
+            f"{MANIFEST} (a run's {_IN_RUN}), a Hub id 'user/name' (with a revision such as main "
+            "if a folder 'user' exists)"
             + "".join(f", or {name!r}, which ships with egovcp" for name in shipped_policies())
         )
     try:

@@ -56,7 +56,7 @@ def parse_config[C](
         SystemExit: after ``--help``.
     """
     try:
-        args = split_flags(argv, config_class, prog)
+        args = split_flags(argv, config_class)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
         default_values: Mapping[str, Any] = {}
         with suppress(*[EgovcpError] if topics else []):  # help is always possible

@@ -53,13 +53,14 @@ class _Graph(NamedTuple):
 
 
 class GraphedFunction:
-    """A function that is captured once per shape of its arguments and then replayed.
+    """A function that is captured once per shape of its arguments and mode of autocast, and then
+    replayed.
 
     Args:
         function: takes and returns tensors, None, or tuples of them; without synchronisation,
             random numbers and side effects. Arguments other than tensors are part of the shape.
         capture: makes a graph, or raises `RuntimeError`; None: `capture_graph`.
-        max_graphs: most shapes that are captured; others run without a graph.
+        max_graphs: most shapes, failed captures included; others run without a graph.
         copies: return copies of the results, which later calls do not overwrite.
     """
 
@@ -78,7 +79,9 @@ class GraphedFunction:
 
     def __call__(self, *arguments: Any) -> Any:
         """The results of the function."""
-        key = _shape(arguments)
+        kind = next(_tensors(arguments)).device.type
+        autocast = torch.is_autocast_enabled(kind) and torch.get_autocast_dtype(kind)
+        key = autocast, _shape(arguments)
         if key not in self._graphs:
             full = len(self._graphs) >= self._max_graphs
             self._graphs[key] = None if full else self._make(arguments)
@@ -120,7 +123,7 @@ def _map(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def _shape(tree: Any) -> object:
-    """The key of a graph: shapes, dtypes and devices of the tensors, and all other values."""
+    """Of the key of a graph: shapes, dtypes and devices of the tensors, and all other values."""
     if not isinstance(tree, tuple):
         return (tree.shape, tree.dtype, tree.device) if isinstance(tree, Tensor) else tree
     return (type(tree), *(_shape(part) for part in tree))

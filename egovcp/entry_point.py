@@ -11,8 +11,8 @@ Exit codes beyond those of `egovcp.errors`: 130 after Ctrl-C, 141 if the reader 
 closed it (``| head -1``), 1 with a traceback for a bug.
 
 Several libraries swallow a KeyboardInterrupt during their import, or turn it into an ImportError.
-So SIGINT ends the process at once before a command has started, and is delivered after the import
-later.
+Before the command starts, SIGINT ends the process at once. Afterwards, during an import, it is
+delivered when the import is over.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that sign
 _WRITE_ERRNOS = (errno.EAGAIN, errno.EBADF, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENOSPC)
 #: Integers, without which `huggingface_hub` cannot be imported.
 _HUB_VARIABLES = ("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT")
+_TASK_FLAGS = tuple(f"--{name}" for name in ("task", "env.task"))  # the second is LeRobot's
 
 
 class EntryPoint:
@@ -103,11 +104,13 @@ class EntryPoint:
         """
         args, places = list(argv), 0
         for i, (previous, arg) in enumerate(zip(["", *args], argv, strict=False)):
-            value = arg.removeprefix("--task=")
-            is_task = value != arg or previous == "--task"
-            is_flag_value = previous.startswith("-") and "=" not in previous
-            if not arg.startswith("-") and not is_flag_value:
-                is_task = places == self._task_argument
+            flag, equals, value = arg.partition("=")
+            is_task = flag in _TASK_FLAGS
+            if not equals:
+                value, is_task = arg, previous in _TASK_FLAGS
+            takes_value = previous.startswith("--") and "=" not in previous
+            if not arg.startswith("-") and (not takes_value or previous == "--debug"):
+                value, is_task = arg, places == self._task_argument
                 places += 1
             if ":" in value and is_task:
                 from egovcp.sim.tasks.registry import register_task

@@ -75,7 +75,8 @@ class ArtifactError(EgovcpError):
 
 
 class EnvironmentFailure(EgovcpError):
-    """A failure of disk, permissions, network, device or port."""
+    """The machine or other software prevents the work: disk, permissions, network, device, port, a
+    missing package, a defective plugin, a failed process, or a file that exists already."""
 
     exit_code = 5
 

@@ -75,7 +75,8 @@ class Gain(NamedTuple):
     success_interval: Interval
 
     def word(self, better: str = "better", worse: str = "worse", same: str = "undecided") -> str:
-        """By the interval of the reward."""
+        """``better`` or ``worse`` if the interval of the reward's difference excludes 0, else
+        ``same``."""
         low, high = self.reward_interval
         return better if low > 0 else worse if high < 0 else same
 
@@ -167,7 +168,7 @@ class EvalScores:
         )
 
     def figures(self) -> dict[str, Any]:
-        """For programs."""
+        """The scores as JSON values."""
         return {
             "seeds": len(self.reward),
             "episodes": self.reward.shape[1],

@@ -17,7 +17,6 @@ from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
 from egovcp.files import UnsafeFileError, read_text, user_path
-from egovcp.removed_options import refuse_removed_flag
 from egovcp.values import (
     WrongValue,
     collection_or_text,
@@ -69,12 +68,11 @@ def _flags(
             yield from _flags(kind, name, limits, hides)
 
 
-def split_flags(argv: Sequence[str], config_class: type, prog: str) -> list[str]:
-    """The arguments of ``prog`` as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is
-    true.
+def split_flags(argv: Sequence[str], config_class: type) -> list[str]:
+    """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
 
     Raises:
-        UsageError: a flag is unknown, removed, or without its value, or an argument is no flag.
+        UsageError: a flag is unknown or without its value, or an argument is no flag.
     """
     joined: list[str] = []
     for arg in argv:
@@ -84,10 +82,10 @@ def split_flags(argv: Sequence[str], config_class: type, prog: str) -> list[str]
         else:
             joined.append(arg)
     flags = options_of(config_class)
-    return [_checked(arg, flags, prog) for arg in joined]
+    return [_checked(arg, flags) for arg in joined]
 
 
-def _checked(arg: str, flags: Mapping[str, Any], prog: str) -> str:
+def _checked(arg: str, flags: Mapping[str, Any]) -> str:
     flag, equals, value = arg.partition("=")
     if flag in HELP:
         return arg
@@ -97,7 +95,6 @@ def _checked(arg: str, flags: Mapping[str, Any], prog: str) -> str:
     if not flag.startswith("-"):
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:
-        refuse_removed_flag(flag, prog)
         known = [name for name, kind in flags.items() if kind is not NOT_A_FLAG]
         raise WrongValue(f"unknown option {flag}{did_you_mean(flag, known)}")
     if flags[flag] is NOT_A_FLAG:

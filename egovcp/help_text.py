@@ -95,7 +95,8 @@ def help_text(
         return "\n".join(lines + textwrap.wrap(f"{_SYNTAX} {epilog}".strip(), _WIDTH))
     names = {group.name.partition(".")[0] for group in groups} | {g.name for g in groups}
     if topic != ALL and topic not in names - {""}:
-        raise UsageError(f"--help={topic}: no such group{did_you_mean(topic, names - {''})}")
+        near = did_you_mean(topic, names - {""})
+        raise UsageError(f"--help={topic}: no such group{near}; --help lists the groups")
     shown = [g for g in groups if topic == ALL or f"{g.name}.".startswith(f"{topic}.")]
     return "\n".join([line for group in shown for line in _section(group, full=True)][1:])
 

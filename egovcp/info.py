@@ -58,7 +58,7 @@ def machine_report() -> dict[str, Any]:
 
 def _int8() -> str:
     try:
-        library.library()
+        library.load_kernel()
     except EnvironmentFailure as error:
         return f"unavailable: {error}"
     return "available" if library.processor_is_fast() else "available, but slow on this processor"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Final
 
 from egovcp.artifact import Artifact, load_artifact
-from egovcp.bounds import OutOfBounds, bounded
+from egovcp.bounds import OutOfBounds
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_compatible
 from egovcp.plan.config import (
@@ -17,6 +18,13 @@ from egovcp.plan.config import (
     TerminationRule,
     require_affordable,
 )
+
+_PLANNER: Final = {option.name: option for option in fields(PlannerConfig)}
+
+
+def _change(option: str) -> Any:
+    """A field that is None by default, with the bounds of this option of the planner."""
+    return field(default=None, metadata=_PLANNER[option].metadata)
 
 
 @dataclass(frozen=True)
@@ -40,22 +48,22 @@ class PolicyOptions:
 class PlannerOptions:
     """Changes to the policy's planner."""
 
-    samples: int | None = bounded(None, least=1, most=2**20)
+    samples: int | None = _change("samples")
     """M, candidate plans per iteration."""
-    horizon: int | None = bounded(None, least=1, most=1000)
+    horizon: int | None = _change("horizon")
     """N, planning horizon, planner steps (of 40 ms for the G1)."""
     objective: Objective | None = None
     """V of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward."""
-    iterations: int | None = bounded(None, least=1, most=10_000)
+    iterations: int | None = _change("iterations")
     """Iterations of the search."""
-    elites: int | None = bounded(None, least=1, most=2**20)
+    elites: int | None = _change("elites")
     """Best candidates that the next iteration is fitted to."""
-    min_std: float | None = bounded(None, least=0)
+    min_std: float | None = _change("min_std")
     """Smallest sampling standard deviation, in units of eta."""
-    action_rate_cost: float | None = bounded(None, least=0)
+    action_rate_cost: float | None = _change("action_rate_cost")
     """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step."""
-    pose_cost: float | None = bounded(None, least=0)
+    pose_cost: float | None = _change("pose_cost")
     """Coefficient of mean(a_t^2) in the cost of a step."""
     action_parameterization: ActionParameterization | None = None
     """How a sample becomes actions: target (move towards one target, then hold it), or random_walk
@@ -70,7 +78,8 @@ class PlannerOptions:
     mirror: bool | None = None
     """Average V with that of the mirrored plan in the mirrored scene, if the robot is symmetric."""
     backend: BackendName | None = None
-    """Implementation of the networks: auto, eager, float32 or int8."""
+    """Implementation of the networks: eager (the world model itself), float32 (packed networks),
+    int8 (8-bit integers, on CPUs only), or auto (int8 on CPUs where it is fast, else float32)."""
 
     def apply(self, planner: PlannerConfig) -> PlannerConfig:
         """``planner`` with these changes.

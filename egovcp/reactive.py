@@ -49,8 +49,6 @@ class ReactiveConfig:
     """Channels of the three layers of the depth CNN; actor and critic have one each."""
     hidden: tuple[int, ...] = bounded((256, 128), least=1, most=8192, longest=16)
     """Hidden layers of actor and critic, after the CNN."""
-    depth_max_m: float = bounded(spec.DEPTH_MAX_M, least=0.1, most=100)
-    """Depth, in metres, at which nearness is 0."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -71,20 +69,18 @@ class FrameStack:
     """The last depth images of E robots, for training and playing."""
 
     def __init__(self, robots: int, config: ReactiveConfig) -> None:
-        self._max_m = config.depth_max_m
-        shape = (robots, config.frames, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-        self._pictures = torch.zeros(shape)
+        self._images = torch.zeros(robots, config.frames, spec.DEPTH_ROWS, spec.DEPTH_COLS)
 
-    def push(self, depth: NDArray[np.uint16], fresh: NDArray[np.bool_]) -> Tensor:
+    def push(self, depth: NDArray[np.uint16], is_first: NDArray[np.bool_]) -> Tensor:
         """Add depth (E, 48, 64) mm; returns nearness (E, frames, 48, 64), newest first.
 
-        Rows with ``fresh`` (E,) start an episode: all their frames are set to the newest.
+        Rows with ``is_first`` (E,) start an episode: all their frames are set to the newest.
         """
-        near = nearness(torch.from_numpy(depth.astype(np.int32)), self._max_m)[:, None]
-        self._pictures = torch.cat([near, self._pictures[:, :-1]], 1)
-        rows = torch.from_numpy(np.asarray(fresh))
-        self._pictures[rows] = near[rows].expand(-1, self._pictures.shape[1], -1, -1)
-        return self._pictures
+        near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)[:, None]
+        self._images = torch.cat([near, self._images[:, :-1]], 1)
+        rows = torch.from_numpy(np.asarray(is_first))
+        self._images[rows] = near[rows].expand(-1, self._images.shape[1], -1, -1)
+        return self._images
 
 
 @dataclass(frozen=True)
@@ -100,9 +96,9 @@ class ReactiveNetwork:
     """Command, seed and steps of the training."""
 
     @torch.inference_mode()
-    def __call__(self, pictures: Tensor, state: Tensor) -> Tensor:
-        """Pictures (E, frames, 48, 64) and state (E, 74) -> actions (E, 7) in [-1, 1]."""
-        x = pictures
+    def __call__(self, images: Tensor, state: Tensor) -> Tensor:
+        """Nearness (E, frames, 48, 64) and state (E, 74) -> actions (E, 7) in [-1, 1]."""
+        x = images
         for i, stride in enumerate(STRIDES):
             x = F.elu(F.conv2d(x, *self._layer("cnn", i), stride))
         standardised = (state - self.tensors["mean"]) / self.tensors["std"]
@@ -142,7 +138,7 @@ class ReactiveNetwork:
             file = read_tensor_file(path, _LIMIT_BYTES)
             if file.metadata.get("schema") != SCHEMA:
                 raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
-            content = decode(_Content, file.json_metadata("content"), "content")
+            content = _decode(file.json_metadata("content"))
             file.require(tensor_shapes(content.config))
             tensors = load(file.content)
             if not all(tensor.isfinite().all() for tensor in tensors.values()):
@@ -165,6 +161,14 @@ class ReactiveNetwork:
                 f"this policy was trained with the low-level controller {self.controller_id}, the "
                 f"robot has {controller_id}; choose its --env.controller, or train again"
             )
+
+
+def _decode(content: Any) -> _Content:
+    """Raises `DecodeError`; files of earlier versions have the range of the camera, too."""
+    config = content.get("config") if isinstance(content, dict) else None
+    if isinstance(config, dict) and config.get("depth_max_m") == spec.DEPTH_MAX_M:
+        del config["depth_max_m"]
+    return decode(_Content, content, "content")
 
 
 def tensor_shapes(config: ReactiveConfig) -> dict[str, tuple[int, ...]]:
@@ -191,7 +195,7 @@ class ReactivePolicy:
     def reset(self) -> None:
         """Start an episode of every robot."""
         self._frames = FrameStack(self._robots, self._network.config)
-        self._fresh = np.ones(self._robots, dtype=np.bool_)
+        self._is_first = np.ones(self._robots, dtype=np.bool_)
 
     def act(
         self,
@@ -200,8 +204,8 @@ class ReactivePolicy:
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
         """Depth (E, 48, 64) mm and state (E, 74) -> actions, without a plan."""
-        pictures = self._push(depth)
-        action = self._network(pictures, torch.as_tensor(state, dtype=torch.float32)).numpy()
+        images = self._push(depth)
+        action = self._network(images, torch.as_tensor(state, dtype=torch.float32)).numpy()
         return PolicyStep(action)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
@@ -212,6 +216,6 @@ class ReactivePolicy:
         """Does nothing: the next state contains the action."""
 
     def _push(self, depth: NDArray[np.uint16]) -> Tensor:
-        pictures = self._frames.push(depth, self._fresh)
-        self._fresh = np.zeros(self._robots, dtype=np.bool_)
-        return pictures
+        images = self._frames.push(depth, self._is_first)
+        self._is_first = np.zeros(self._robots, dtype=np.bool_)
+        return images

@@ -92,8 +92,13 @@ class RobotSpec:
             ("state_names", self.state_names, MAX_STATE),
             ("action_names", self.action_names, MAX_ACTIONS),
         ):
-            if not 1 < len(names) <= most or len(set(names)) < len(names) or not all(names):
-                yield f"{what} are {len(names)} names, expected 2 to {most}, all different"
+            if not 1 < len(names) <= most:
+                yield f"{what} are {len(names)} names, expected 2 to {most}"
+            if "" in names:
+                yield f"{what}[{names.index('')}] is empty"
+            for name in names:
+                if names.count(name) > 1:
+                    yield f"{what} has {name!r} twice"
         size = self.action_dim
         if not _is_ascending(self.action_box, size):
             yield (

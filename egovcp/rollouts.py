@@ -11,14 +11,14 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.data import DatasetReader, Episode
+from egovcp.data.schema import COLLECTION_PATH
+from egovcp.decode import DecodeError, decode
 from egovcp.errors import DataError
-from egovcp.log.tick import CameraView, RunInfo, Tick
+from egovcp.log.tick import CONTROLLER, CameraView, RunInfo, Tick
 from egovcp.rate import NS_PER_S
 from egovcp.robot_spec import RobotSpec
 from egovcp.spec import EVENT_REWARD, PLANNER_HZ
 
-#: Key of `RunInfo.hashes` that names the low-level controller.
-CONTROLLER: Final = "low_level_controller"
 POSE: Final = (
     "The pelvis pose is not recorded: the robot is drawn at the origin, at its commanded height, "
     "with the tilt of its IMU."
@@ -26,14 +26,24 @@ POSE: Final = (
 _SEED_DIGITS: Final = 12  # hexadecimal; larger than seeds of collections and evaluations
 
 
-def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
-    """The run description of the recording of an episode."""
+def recording_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
+    """The run description of the recording of an episode.
+
+    Raises:
+        DataError: a value in ``collection.json`` has another type or is out of bounds.
+    """
     facts, known = episode.metadata, reader.provenance
+    try:
+        given = {"seed": 0, "episode": index} | {k: v for k, v in facts.items() if v is not None}
+        seed, number = (decode(int, given[key], key) for key in ("seed", "episode"))
+        camera = camera_view(known.get("config", {}), facts)
+    except DecodeError as error:
+        raise DataError.at(reader.root / COLLECTION_PATH, str(error), index) from error
     return RunInfo(
         task=episode.task,
-        seed=int(facts.get("seed") or 0),
-        episode=int(facts.get("episode", index)),
-        camera=camera_view(known.get("config", {}), facts),
+        seed=seed,
+        episode=number,
+        camera=camera,
         config={
             **known.get("config", {}),
             **({"pose": POSE} if reader.robot.is_g1 else {}),
@@ -51,14 +61,16 @@ def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
 
 
 def camera_view(config: Mapping[str, Any], facts: Mapping[str, Any]) -> CameraView:
-    """The camera of an episode; default values where it is not recorded."""
-    camera, usual = config.get("env", {}).get("camera", {}), CameraView()
-    x, y, z = camera.get("position", usual.position)
-    return CameraView(
-        position=(x, y, z),
-        pitch=facts.get("camera_pitch", usual.pitch),
-        vertical_fov=camera.get("vertical_fov", usual.vertical_fov),
-    )
+    """The camera of an episode; the default values where it is not recorded.
+
+    Raises:
+        DecodeError: a value has another type or is out of bounds.
+    """
+    camera = config.get("env", {}).get("camera", {})
+    found = {key: camera[key] for key in ("position", "vertical_fov") if key in camera}
+    if (pitch := facts.get("camera_pitch")) is not None:
+        found["pitch"] = pitch
+    return decode(CameraView, found, "camera")
 
 
 def ticks_of(episode: Episode) -> Iterator[Tick]:
@@ -89,7 +101,7 @@ def _events(episode: Episode, t: int) -> Iterator[str]:
     if abs(episode.reward[t] - np.median(episode.reward)) > EVENT_REWARD:
         yield f"reward {episode.reward[t]:+.3f}"
     if episode.done[t]:
-        yield "a fall ends the episode" if episode.terminated else "the time is up"
+        yield "a fall ends the episode" if episode.terminated else "the episode is truncated"
 
 
 def follows(before: Tick, tick: Tick, fps: int = PLANNER_HZ) -> bool:
@@ -137,12 +149,20 @@ def _depth(tick: Tick, robot: RobotSpec) -> np.ndarray[Any, np.dtype[np.uint16]]
 
 
 def planned_ticks(info: RunInfo) -> int:
-    """Configured length of the run, ticks; 0 if unknown."""
-    if "time_limit" in info.config:
-        return int(str(info.config["time_limit"]))
-    env = info.config.get("env")
-    scene = env.get(f"{info.task}_episode", {}) if isinstance(env, Mapping) else {}
-    return int(scene.get("ticks", 0))
+    """Configured length of the run, ticks; 0 if unknown.
+
+    Raises:
+        DataError: it is recorded, but not as a whole number.
+    """
+    scene = f"{info.task}_episode"
+    try:
+        if "time_limit" in info.config:
+            return decode(int, info.config["time_limit"], "time_limit")
+        env = decode(dict[str, Any], info.config.get("env", {}), "env")
+        options = decode(dict[str, Any], env.get(scene, {}), f"env.{scene}")
+        return decode(int, options.get("ticks", 0), f"env.{scene}.ticks")
+    except DecodeError as error:
+        raise DataError(f"its configuration is damaged: {error}") from error
 
 
 def _facts(info: RunInfo, episode: Episode) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """Names, shapes, units and clock rates shared by all packages.
 
-Axis letters used in shape comments throughout the code:
+Axis letters in shapes; a module that uses others, or these for something else, explains them:
 
     B batch (episodes, environments or sequences)    T time (planner ticks)
     H depth rows (48)                                W depth columns (64)
     S proprioceptive state (74)                      A action (7)
     J joints (29)                                    M candidate plans
-    N planning horizon                               P physics steps
+    N planning horizon                               E robots, episodes or scenarios
 
 Units are SI (metres, radians, seconds) unless a name says otherwise. Frames: a
 suffix ``_w`` is the world, ``_b`` the pelvis *heading* frame (origin at the pelvis,
@@ -15,6 +15,7 @@ x forward, y left, z up, rotated by yaw only).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -38,6 +39,11 @@ DEPTH_ROWS: Final = 48
 DEPTH_COLS: Final = 64
 DEPTH_MIN_M: Final = 0.28  # a D435i sees nothing nearer: closer surfaces read 0
 DEPTH_MAX_M: Final = 5.0  # farther surfaces read 0 (invalid)
+#: Default of the simulated camera: mount in the torso frame, m; downward tilt, rad, drawn per
+#: episode; vertical field of view, rad.
+CAMERA_POSITION: Final = (0.058, 0.0, 0.42)
+CAMERA_PITCH_RANGE: Final = (math.radians(-15.0), math.radians(-10.0))
+CAMERA_VERTICAL_FOV: Final = math.radians(58.0)
 
 # --- robot -----------------------------------------------------------------------
 JOINT_NAMES: Final = (
@@ -110,7 +116,7 @@ ACTION_HANDS: Final = slice(0, 6)
 # In normalised units ([-1, 1]):
 ACTION_ETA: Final = 0.32  # largest step of the paper's random walk (section III-B), each tick
 ACTION_RATE_LIMIT: Final = 0.32  # per planner tick; same in collection and deployment
-#: Of the default random walk of the data, which holds its targets: largest step, and planner ticks
+#: Default random walk of egovcp-collect, which holds its targets: largest step, and planner ticks
 #: from one step to the next (least, most). The low-level controller is trained on both walks.
 HELD_ETA: Final = 1.0
 HELD_TICKS: Final = (5, 15)
@@ -204,8 +210,8 @@ OBJECT_KEY: Final = "privileged.object"  # of the simulator: trained on, never a
 #: Position of the task's object (m, heading frame), and whether it is known (1) or zeros (0).
 OBJECT_NAMES: Final = ("x", "y", "z", "known")
 OBJECT_DIM: Final = len(OBJECT_NAMES)
-#: In the features of `egovcp.data.privileged`: position (m) and velocity (m/s) of
-#: the object when it was last known, heading frame, and whether it is known now.
+#: In the features of `egovcp.data.privileged`: position (m) in the heading frame of the object when
+#: it was last known, its rate there (m/s), and whether it is known now.
 OBJECT_STATE: Final = slice(0, 6)
 OBJECT_KNOWN: Final = 6
 CONTROLLER_ID_KEY: Final = "controller_id"  # of the low-level controller, in LeRobot's `info`
@@ -238,6 +244,6 @@ FEATURES: Final[dict[str, dict[str, object]]] = {
 #: Columns that datasets of earlier versions lack; they are read as zeros.
 OPTIONAL_KEYS: Final = (REWARD_TERMS_KEY, OBJECT_KEY)
 
-# --- returns (paper eq. 9; DESIGN of the Monte Carlo target) ------------------------
+# --- defaults of `ReturnConfig` (paper, equation 9) -----------------------------------
 GAMMA: Final = 0.97
 RETURN_STEPS: Final = 16

@@ -126,10 +126,11 @@ class CommandGroup:
         switches = {flag for flag, kind in flags_of(config_class).items() if kind is bool}
         switches |= {"--debug", *HELP}
         for arg in args:
-            if arg.startswith("-"):
-                flags.append(arg)
-            elif flags and "=" not in flags[-1] and flags[-1] not in switches:
+            takes_value = flags and "=" not in flags[-1] and flags[-1] not in switches
+            if takes_value and not arg.startswith("--"):
                 flags[-1] += f"={arg}"
+            elif arg.startswith("-"):
+                flags.append(arg)
             else:
                 places.append(arg)
         named = [

@@ -20,16 +20,16 @@ import yaml
 from egovcp.bounds import OutOfBounds, as_flag_value
 from egovcp.errors import UsageError, did_you_mean
 from egovcp.files import check_depth
-from egovcp.removed_options import refuse_removed_flag
 
 _BOOLEANS: Final[Mapping[str, bool]] = {
     **dict.fromkeys(("true", "yes", "on"), True),
     **dict.fromkeys(("false", "no", "off"), False),
 }
 _NULL: Final = ("null", "none", "~")
-_INT: Final = re.compile(r"[+-]?[0-9]{1,19}")
+_INTEGER: Final = re.compile(r"[+-]?[0-9]+")
 _YAML_FLOATS: Final[Mapping[Any, str]] = {".inf": "inf", "-.inf": "-inf", ".nan": "nan"}
 _INT_LIMIT: Final = 2**63
+_INT_DIGITS: Final = 20  # with a sign
 _MAIN_OPTIONS: Final = ("root", "path", "type")
 """The option that is probably meant by the name of a group such as ``--dataset``."""
 _SHOWN_OPTIONS: Final = 6
@@ -78,7 +78,7 @@ def type_name(kind: Any) -> str:
         return " or ".join(map(str, args))
     if args:
         return " or ".join(type_name(part) for part in args)
-    names = {str: "text", NoneType: "null", Ellipsis: "..."}
+    names = {str: "text", bool: "true or false", NoneType: "null", Ellipsis: "..."}
     return names.get(kind) or str(kind.__name__)
 
 
@@ -155,7 +155,6 @@ def build[C](
     options = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     for key in values:
         if key not in options:
-            refuse_removed_flag(f"{prefix}{key}")
             near = did_you_mean(f"{prefix}{key}", [f"{prefix}{name}" for name in options])
             raise WrongValue(f"unknown option {prefix}{as_flag_value(key)}{near}")
     found: dict[str, Any] = {}
@@ -208,8 +207,12 @@ def convert(kind: Any, value: Any, name: str, default: Any = None, strict: bool 
         return _text(value, name)
     found = _scalar(kind, value, strict)
     if found is None:
-        near = did_you_mean(value, args) if origin is Literal and isinstance(value, str) else ""
-        raise WrongValue.of(name, value, kind, near)
+        is_text = isinstance(value, str)
+        hint = did_you_mean(value, args) if origin is Literal and is_text else ""
+        is_integer = _INTEGER.fullmatch(value) if is_text and not strict else type(value) is int
+        if kind is int and is_integer:
+            hint = " of a size below 2^63"
+        raise WrongValue.of(name, value, kind, hint)
     return found
 
 
@@ -279,7 +282,7 @@ def _scalar(kind: Any, value: Any, strict: bool) -> Any:
     if isinstance(value, bool):
         return None
     if kind is int:
-        if isinstance(value, str) and _INT.fullmatch(value):
+        if isinstance(value, str) and len(value) <= _INT_DIGITS and _INTEGER.fullmatch(value):
             value = int(value)
         return value if isinstance(value, int) and abs(value) < _INT_LIMIT else None
     if kind is float and isinstance(value, int | float | str):

@@ -1,13 +1,13 @@
-"""Let a trained world model imagine the consequences of an action, and print Q.
+"""Let a trained world model imagine the consequences of two actions, and print Q.
 
     python examples/imagine.py POLICY DATASET
 
-POLICY is a folder or a Hub id, DATASET a folder or a Hub id of episodes of the same controller.
+The episodes of DATASET must be of the policy's robot and low-level controller.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import torch
 
@@ -32,15 +32,21 @@ def main(policy: str, dataset: str) -> None:
         carry = model.observe(carry, sent, depth[t : t + 1], state[t : t + 1], start)
 
     # Imagine: the same state under two constant actions.
-    for name, action in (("hands at rest", 0.0), ("both hands up", 1.0)):
+    for name, action in (("the neutral pose", 0.0), ("the upper end of every action", 1.0)):
         plan = torch.full_like(actions[:1], action)
         imagined = carry
         print(f"{name}: Q = {float(model.value(imagined, plan)):+.4f}")
         for _ in range(STEPS):
             imagined = model.imagine(imagined, plan)
         image, _ = model.decode(imagined)
-        print(f"  nearest pixel after {STEPS} steps: {float(image[image > 0].min()):.2f} m")
+        seen = image[image > 0]
+        nearest = f"{float(seen.min()):.2f} m" if len(seen) else "nothing in range"
+        print(f"  nearest pixel after {STEPS} steps: {nearest}")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("policy", help="folder, Hub id, or contact, which ships with egovcp")
+    parser.add_argument("dataset", help="folder or Hub id")
+    args = parser.parse_args()
+    main(args.policy, args.dataset)

@@ -1,4 +1,4 @@
-"""Collect, train and evaluate in Python: what `make quickstart` does with three commands.
+"""Collect, train and evaluate in Python, with the options of `make quickstart`.
 
     python examples/quickstart.py OUTPUT_DIR
 
@@ -16,14 +16,14 @@ from egovcp_deploy.evaluate import main as evaluate
 from egovcp_train.train import main as train
 
 
-def run(output: Path, episodes: int, minutes: float, scenarios: int, options: list[str]) -> float:
+def run(output: Path, episodes: int, scenarios: int, options: list[str]) -> float:
     """Return the planner's success rate over new scenarios of the ball task; exits with the code of
-    a command that fails."""
+    a command that fails. ``options`` are further ones of the training."""
     data, policy = output / "dataset", output / "policy"
-    limit = f"--max_minutes={minutes}"
-    if code := collect(["--task=ball", f"--dataset.root={data}", f"--episodes={episodes}"]):
+    root, recipe = f"--dataset.root={data}", ["--preset=laptop", "--seed=0"]
+    if code := collect(["--task=ball", root, f"--episodes={episodes}", "--seed=0"]):
         raise SystemExit(code)
-    if code := train([f"--dataset.root={data}", f"--output_dir={policy}", limit, *options]):
+    if code := train([root, f"--output_dir={policy}", *recipe, *options]):
         raise SystemExit(code)
     if code := evaluate(
         [
@@ -42,11 +42,10 @@ def run(output: Path, episodes: int, minutes: float, scenarios: int, options: li
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output_dir", type=Path)
-    parser.add_argument("--episodes", type=int, default=5000, help="throws to collect")
-    parser.add_argument("--minutes", type=float, default=9.5, help="length of the training")
+    parser.add_argument("--episodes", type=int, default=4000, help="throws to collect")
     parser.add_argument("--scenarios", type=int, default=80, help="throws to evaluate on")
     args, options = parser.parse_known_args()
-    rate = run(args.output_dir, args.episodes, args.minutes, args.scenarios, options)
+    rate = run(args.output_dir, args.episodes, args.scenarios, options)
     print(f"the planner blocks {rate:.0%} of the balls")
 
 

@@ -61,6 +61,24 @@ def violations(folder: Path, forbidden: tuple[str, ...]) -> list[str]:
     ]
 
 
+def test_every_path_in_the_table_of_the_architecture_page_exists() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    missing, checked = [], 0
+    for line in text.splitlines():
+        folders = [ROOT]
+        for name in re.findall(r"`([\w/]+(?:/|\.py))`", line.rpartition(" | ")[2]):
+            # a file is in one of the folders named before it; a folder may also be beside one
+            beside = [folder.parent for folder in folders[1:]] if name.endswith("/") else []
+            found = [place / name for place in (*folders, *beside) if (place / name).exists()]
+            checked += 1
+            if found:
+                folders.append(found[0] if found[0].is_dir() else found[0].parent)
+            else:
+                missing.append(f"{line[:40]}: {name}")
+    assert missing == []
+    assert checked > 60
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_applications_import_only_the_library(package: str) -> None:
     own = (package, "egovcp", *ALLOWED.get(package, ()))

@@ -160,8 +160,6 @@ def test_more_threads_or_processes_than_cores_can_share_are_refused(
     [
         ("egovcp-collect", ["--num_envs=65536", "--episodes=200000"]),
         ("egovcp-eval", ["--num_envs=65536", "--episodes=200000", "--controllers=hold"]),
-        ("egovcp-train", ["--batch_size=65536"]),
-        ("egovcp-train", ["--sampling.length=100000", "--batch_size=2"]),
         ("egovcp-train-ppo", ["--robots=65536"]),
         ("egovcp-train-lowlevel", ["--robots=65536"]),
     ],

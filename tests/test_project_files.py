@@ -59,6 +59,16 @@ def test_only_the_publishing_job_may_request_a_token() -> None:
     assert found == [("release.yml", "publish")]
 
 
+def test_the_home_page_shows_the_beginning_of_the_readme() -> None:
+    page, readme = ((ROOT / name).read_text() for name in ("docs/index.md", "README.md"))
+    (shown,) = re.findall(r'--8<-- "README.md:(\d+):(\d+)"', page)
+    first, last = map(int, shown)
+    lines = readme.splitlines()
+    assert not lines[first - 2]
+    assert lines[first - 1].startswith("**Train")
+    assert lines[last + 1].startswith("![")
+
+
 def test_the_citation_names_the_version_and_the_paper() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import shutil
 import sys
@@ -14,17 +13,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from tqdm import tqdm
 
 from egovcp.cli import preset_defaults, run_command
 from egovcp.data import DatasetConfig
 from egovcp.data.committer import Committer, open_committer
-from egovcp.data.episode import frame_layout
+from egovcp.data.episode import frame_bytes
 from egovcp.data.source import local_root
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hardware import available_cores
-from egovcp.robot_spec import RobotSpec
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
@@ -130,12 +127,6 @@ def _missing_scenarios(config: CollectConfig, committer: Committer) -> list[Scen
     numbers = set(committer.missing(config.episodes))
     through = replace(config, episodes=max(numbers, default=0) + 1)
     return [scenario for scenario in through.scenarios() if scenario.episode in numbers]
-
-
-def frame_bytes(robot: RobotSpec) -> int:
-    """Bytes of the arrays of a frame."""
-    layout = frame_layout(robot).values()
-    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout)
 
 
 def min_bytes(scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int) -> int:

@@ -35,6 +35,7 @@ def make_provenance(config: CollectConfig, command: str) -> Provenance:
             "task": ",".join(config.tasks),  # what `all` means depends on what is installed
             "mix": {task: config.mix[task] for task in config.tasks if task in config.mix},
         },
+        origin="simulated",
     )
 
 

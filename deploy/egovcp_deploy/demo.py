@@ -8,7 +8,7 @@ from typing import Final
 
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
-from egovcp.log.picture import AHEAD
+from egovcp.log.rollout_video import AHEAD
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.sim.config import EnvConfig, evaluation_config

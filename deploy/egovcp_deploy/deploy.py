@@ -22,11 +22,11 @@ from egovcp_deploy.rollouts import play_rollouts, replay
 PROG: Final = "egovcp-deploy"
 _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
-    "Writes rollout-<i>.mcap, rollout-<i>.rrd, pictures of the first rollouts, and deploy.json, "
-    "which summarises the complete rollouts, also after an interrupt. On a robot the first Ctrl-C "
-    "holds it, the second damps its motors: a standing robot collapses to the floor. With "
-    "--operator.duration the first one also ends the run, 2 s later. Exit code 6: the robot was "
-    "held or damped because something failed."
+    "Writes rollout-<i>.mcap, rollout-<i>.rrd, PNG and GIF of the first rollouts (not of a live "
+    "run), and deploy.json, which summarises the complete rollouts, also after an interrupt. On a "
+    "robot the first Ctrl-C holds it, the second damps its motors: a standing robot collapses to "
+    "the floor. With --operator.duration the first one also ends the run, 2 s later. Exit code 6: "
+    "the robot was held or damped because something failed."
 )
 
 

@@ -20,7 +20,7 @@ from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
 from egovcp.files import user_path
 from egovcp.hardware import available_cores
-from egovcp.log.picture import AHEAD, PictureSink
+from egovcp.log.rollout_video import AHEAD, RolloutVideoSink
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.plan import Policy, PolicyStep, blank_observation
 from egovcp.policy_options import PolicyOptions, load_policy
@@ -122,7 +122,7 @@ def play_group(
     terminated: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
     parts: tuple[dict[str, bool], ...] = ({},) * num_envs
     terms: dict[str, NDArray[np.float64]] = {}
-    sinks = [PictureSink(*video_paths(stem)) for stem in videos]
+    sinks = [RolloutVideoSink(*video_paths(stem)) for stem in videos]
     for sink in sinks:
         sink.open(RunInfo("", robot=env.robot))
     while not env.done.all() and not stopped():

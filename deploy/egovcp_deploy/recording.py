@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink, warn_on_stderr
 from egovcp.log.mcap import McapSink
-from egovcp.log.tick import CameraView, Fanout, RunInfo, Sink
+from egovcp.log.tick import CONTROLLER, CameraView, Fanout, RunInfo, Sink
 from egovcp.packages import is_installed
 from egovcp.terminal import echo
 from egovcp_deploy.options import evaluation_versions, video_paths
@@ -23,8 +23,6 @@ from egovcp_deploy.options import evaluation_versions, video_paths
 if TYPE_CHECKING:
     from egovcp.log.viewer import Viewer
     from egovcp_deploy.config import DeployConfig
-
-_CONTROLLER: Final = "low_level_controller"  # key of its identity
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,8 @@ class LogOptions:
     """Write a Rerun file too; Rerun also opens the MCAP file."""
     videos: int = bounded(1, least=0, most=1_000_000)
     """Render the first N rollouts as PNG and GIF, and as MP4 if PyAV is installed
-    (egovcp[video]); needs matplotlib."""
+    (egovcp[video]); needs matplotlib. A live run of a robot is not rendered: replay its MCAP file
+    (--robot.type=replay)."""
 
 
 @contextmanager
@@ -66,8 +65,8 @@ def recording(
     warn: Callable[[str], None] = warn_on_stderr,
 ) -> Iterator[Sink]:
     """Sinks of rollout ``number``. If ``blocking``, the loop may wait for the disk, as in simulated
-    time; else each sink, like any viewer, runs in a separate process, and ``warn`` gets their
-    messages."""
+    time; else nothing is rendered, each sink, like any viewer, runs in a separate process, and
+    ``warn`` gets their messages."""
     stem = folder / f"rollout-{number}"
     mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
     files: dict[str, Sink] = {mcap.name: McapSink(mcap)}
@@ -75,10 +74,10 @@ def recording(
         from egovcp.log.rerun import RerunSink
 
         files[rrd.name] = RerunSink(rrd)
-    if number < options.videos and is_installed("matplotlib"):
-        from egovcp.log.picture import PictureSink
+    if blocking and number < options.videos and is_installed("matplotlib"):
+        from egovcp.log.rollout_video import RolloutVideoSink
 
-        files[f"{stem.name}.gif"] = PictureSink(stem.with_suffix(".png"), *video_paths(stem))
+        files[f"{stem.name}.gif"] = RolloutVideoSink(stem.with_suffix(".png"), *video_paths(stem))
     viewers = list[AsyncSink]()
     if viewer is not None:
         from egovcp.log.rerun import RerunSink
@@ -108,7 +107,7 @@ def missing_ticks(sink: Sink) -> dict[str, int]:
     return {each.name: each.dropped + each.lost for each in sinks}
 
 
-def run_info(
+def make_run_info(
     config: DeployConfig, controller_id: str, artifact: Artifact | None, backend: str
 ) -> RunInfo:
     """The first record of the log of a G1's rollout 0; ``backend`` see `backend_of`.
@@ -125,7 +124,7 @@ def run_info(
             position=mount.position, pitch=sum(mount.pitch_range) / 2, vertical_fov=fov
         ),
         config=config.encoded(),
-        hashes={_CONTROLLER: controller_id, **files},
+        hashes={CONTROLLER: controller_id, **files},
         versions=evaluation_versions(),
         backend=backend,
     )
@@ -137,13 +136,13 @@ def percentiles(name: str, values: list[float]) -> dict[str, float]:
     return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
-def provenance(info: RunInfo) -> dict[str, Any]:
+def provenance_fields(info: RunInfo) -> dict[str, Any]:
     """The part of ``deploy.json`` that says what produced the results."""
-    files = {name: value for name, value in info.hashes.items() if name != _CONTROLLER}
+    files = {name: value for name, value in info.hashes.items() if name != CONTROLLER}
     return {
         "config": info.config,
         "artifact": files or None,  # None: no artifact
-        _CONTROLLER: info.hashes[_CONTROLLER],
+        CONTROLLER: info.hashes[CONTROLLER],
         "backend": info.backend,
         "versions": info.versions,
     }

@@ -19,7 +19,6 @@ from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.files import user_path, write_json
-from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo
@@ -36,7 +35,13 @@ from egovcp_deploy.pilot.planner import (
     planner_fields,
 )
 from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State
-from egovcp_deploy.recording import open_viewer, percentiles, provenance, recording, run_info
+from egovcp_deploy.recording import (
+    make_run_info,
+    open_viewer,
+    percentiles,
+    provenance_fields,
+    recording,
+)
 from egovcp_deploy.robots.replay import ReplayRobot, open_recordings
 
 if TYPE_CHECKING:
@@ -104,7 +109,7 @@ def run_rollout(
         pilot.sent = outcome.sent
         timing_ms = {
             "observe": 1e3 * (observed - begin),
-            "think": 1e3 * (planned - observed),
+            "pilot": 1e3 * (planned - observed),
             "robot": 1e3 * (time.perf_counter() - planned),
         }
         if plan is not None:
@@ -191,10 +196,9 @@ def _play(
                 robot.start(episode)
                 task, seed, number = config.task, config.seed, episode
                 if isinstance(robot, ReplayRobot):
-                    recorded = RecordingReader(robot.files[episode]).info
-                    task, seed, number = recorded.task, recorded.seed, recorded.episode
+                    task, seed, number = robot.info.task, robot.info.seed, robot.info.episode
                 info = replace(
-                    run_info(config, robot.controller_id, artifact, backend),
+                    make_run_info(config, robot.controller_id, artifact, backend),
                     task=task,
                     seed=seed,
                     episode=number,
@@ -210,14 +214,13 @@ def _play(
                 bar.update(1)
     finally:
         if summaries:
+            pairs = enumerate(zip(infos, summaries, strict=False))
+            replayed = isinstance(robot, ReplayRobot)  # recordings may differ in task and seed
             report = {
-                "task": infos[0].task,
-                "seed": infos[0].seed,
+                **({} if replayed else {"task": config.task, "seed": config.seed}),
                 "success_rate": float(np.mean([summary.success for summary in summaries])),
-                "rollouts": [
-                    _row(i, *each) for i, each in enumerate(zip(infos, summaries, strict=False))
-                ],
-                **provenance(info),
+                "rollouts": [_row(i, *pair, config.log.rrd) for i, pair in pairs],
+                **provenance_fields(info),
             }
             write_json(folder / "deploy.json", report)
             for i, summary in enumerate(summaries):
@@ -241,7 +244,7 @@ def _show(bar: Any, tick: Tick) -> None:
     bar.update(0)
 
 
-def _row(rollout: int, info: RunInfo, summary: RolloutSummary) -> dict[str, Any]:
+def _row(rollout: int, info: RunInfo, summary: RolloutSummary, rrd: bool) -> dict[str, Any]:
     return {
         "task": info.task,
         "seed": info.seed,
@@ -257,5 +260,5 @@ def _row(rollout: int, info: RunInfo, summary: RolloutSummary) -> dict[str, Any]
         "damped": summary.damped,
         **percentiles("plan_ms", summary.plan_ms),
         "mcap": f"rollout-{rollout}.mcap",
-        "rrd": f"rollout-{rollout}.rrd",
+        **({"rrd": f"rollout-{rollout}.rrd"} if rrd else {}),
     }

@@ -15,7 +15,7 @@ from egovcp.files import write_text
 from egovcp.outputs import output_file, write_report
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.sim.config import EnvConfig, evaluation_config
-from egovcp.sim.tasks.registry import find_task, name_problem, register_task, task_entries
+from egovcp.sim.tasks.registry import find_task, name_problem, task_entries
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
 from egovcp_deploy.options import SEEDS, make_output_dir
@@ -84,7 +84,7 @@ def run_check(config: CheckTaskConfig) -> None:
     """Print success, rewards and cost; raises `EnvironmentFailure` if the task does not conform."""
     require_packages("egovcp-deploy", "egovcp-task", *SIMULATOR_MODULES)
     try:
-        report = check_task(_name(config.task), config.episodes, config.seed, config.env)
+        report = check_task(config.task, config.episodes, config.seed, config.env)
     except ConformanceError as error:
         raise EnvironmentFailure(f"{error}; repair the class of the task") from error
     write_report(config.json, asdict(report))
@@ -127,12 +127,12 @@ def run_play(config: PlayTaskConfig) -> None:
     from egovcp_deploy.recording import LogOptions, print_viewer_command
     from egovcp_deploy.rollouts import play_rollouts
 
-    name = _name(config.task)
-    if config.controller == "oracle" and not find_task(name).has_oracle():
-        raise UsageError(f"task {name} has no oracle; choose --controller=hold or random")
+    task = find_task(config.task)
+    if config.controller == "oracle" and not task.has_oracle():
+        raise UsageError(f"task {task.name} has no oracle; choose --controller=hold or random")
     rollouts = DeployConfig(
         controller=config.controller,
-        task=name,
+        task=task.name,
         episodes=config.episodes,
         seed=config.seed,
         output_dir=config.output_dir,
@@ -143,13 +143,6 @@ def run_play(config: PlayTaskConfig) -> None:
     folder = play_rollouts(rollouts, None)
     echo(f"video: {folder / 'rollout-0.gif'}")
     print_viewer_command(folder / "rollout-0.rrd")
-
-
-def _name(task: str) -> str:
-    """The name of a task that may be given as ``module:Class``."""
-    if ":" in task:
-        return register_task(task)
-    return find_task(task).name
 
 
 @dataclass(frozen=True)

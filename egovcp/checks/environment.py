@@ -88,10 +88,10 @@ def _check_sent(sent: Array, before: Array, t: int) -> None:
     _require(
         change <= limit + 1e-6,
         t,
-        f"the action sent changed by {change:.3g} (normalised units) in one tick, the rate limit "
-        f"is {limit}",
+        f"the action sent changed by {change:.3g} (normalised units) in one tick, above the rate "
+        f"limit of {limit}; limit it in step",
     )
-    _require(np.abs(sent).max() <= 1 + 1e-6, t, "the action sent leaves [-1, 1]")
+    _require(np.abs(sent).max() <= 1 + 1e-6, t, "the action sent leaves [-1, 1]; clip it in step")
 
 
 def _check_step(step: StepResult, finished: NDArray[np.bool_], t: int) -> None:
@@ -102,7 +102,9 @@ def _check_step(step: StepResult, finished: NDArray[np.bool_], t: int) -> None:
     _require(np.allclose(terms, step.reward), t, "reward is not the sum of its terms")
     _require(not both.any(), t, "a row is terminated and truncated at once")
     _require(done[finished].all(), t, "an episode continues after its end")
-    _require(not np.any(step.reward[finished]), t, "reward after the end of an episode")
+    late = np.flatnonzero(finished & (step.reward != 0))
+    problem = f"rewards {step.reward[late]} in rows {late} after the end of their episodes"
+    _require(not len(late), t, f"{problem}; expected 0")
 
 
 def _require(ok: bool | np.bool_, t: int, problem: str) -> None:

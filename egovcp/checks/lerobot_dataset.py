@@ -30,11 +30,11 @@ from egovcp.checks.lerobot_episode import (
     value_problems,
 )
 from egovcp.data import schema
+from egovcp.data.camera_images import decode_frames, frame_times
 from egovcp.data.features import values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, episode_runs
 from egovcp.data.parquet import data_errors
 from egovcp.data.paths import files_below, require_file
-from egovcp.data.pictures import decode_frames, frame_times
 from egovcp.data.stats import aggregate_named
 from egovcp.errors import DataError, SchemaError
 

@@ -10,9 +10,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.data import schema
-from egovcp.data.features import Feature
+from egovcp.data.camera_images import decode_image
+from egovcp.data.features import Feature, nonfinite_problem
 from egovcp.data.lerobot import LeRobotReader
-from egovcp.data.pictures import decode_image
 from egovcp.errors import DataError, SchemaError
 
 type Problem = tuple[int | None, str]
@@ -46,15 +46,6 @@ def value_problems(values: Mapping[str, NDArray[Any]], reader: LeRobotReader) ->
             at = int(np.argmin(known))
             index = values["task_index"][at, 0]
             yield at, f"task_index {index} is not in {schema.TASKS_PATH}, which has no text for it"
-
-
-def nonfinite_problem(values: NDArray[Any], feature: Feature) -> tuple[int, str] | None:
-    """The first NaN or infinity in the values (T, n) of a feature; None if all are finite."""
-    if values.dtype.kind != "f" or (finite := np.isfinite(values)).all():
-        return None
-    at = int(np.argmin(finite.all(1)))
-    index = int(np.argmin(finite[at]))
-    return at, f"{feature.label(index)} is {values[at, index]}, expected a finite number"
 
 
 def _time_problems(times: NDArray[np.float64], fps: float, has_videos: bool) -> Iterator[Problem]:

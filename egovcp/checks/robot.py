@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import time
+import traceback
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import ConformanceError, UsageError
+from egovcp.errors import ConformanceError, EgovcpError, UsageError
 from egovcp.packages import import_class
 from egovcp.robot_spec import RobotSpec
 from egovcp.spec import ACTION_RATE_LIMIT
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from egovcp.sim.mujoco_robot import MujocoRobot
 
 _TICKS: Final = 40  # of each run
+_NEEDED: Final = {"spec": "describe the robot", "control_id": "name its control and model"}
 _MOST_ASYMMETRY: Final = 0.25  # in standard deviations of a value, beside twice the noise
 
 type Array = NDArray[np.float64]
@@ -46,19 +50,30 @@ def check_robot(robot: type[MujocoRobot] | str) -> RobotReport:
         robot: the class, or ``package.module:Class``.
 
     Raises:
-        ConformanceError: names the robot, the tick and the problem.
+        ConformanceError: names the robot, the tick and the problem, or the error of its class.
         UsageError: there is no such class.
-        EnvironmentFailure: its timestep does not divide the planner tick.
+        EnvironmentFailure: its timestep does not divide the planner tick, or it has no camera.
     """
     kind = _load(robot) if isinstance(robot, str) else robot
-    name, spec = kind.__name__, kind.spec
-    if not getattr(kind, "control_id", ""):
-        raise ConformanceError(f"robot {name}: it has no control_id; name its control and model")
     try:
-        model = kind.build().compile()
-        body = kind(model)
+        return _check(kind)
+    except EgovcpError:
+        raise
     except Exception as error:
-        raise ConformanceError(f"robot {name}: its model cannot be made: {error}") from error
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise ConformanceError(
+            f"robot {kind.__name__}: {type(error).__name__} in {os.path.basename(place.filename)}, "
+            f"line {place.lineno}: {error}"
+        ) from error
+
+
+def _check(kind: type[MujocoRobot]) -> RobotReport:
+    name = kind.__name__
+    for attribute, remedy in _NEEDED.items():
+        if not getattr(kind, attribute, None):
+            raise ConformanceError(f"robot {name}: it has no {attribute}; {remedy}")
+    spec, model = kind.spec, kind.build().compile()
+    body = kind(copy(model))
     rng = np.random.default_rng(0)
     steps = rng.uniform(-ACTION_RATE_LIMIT, ACTION_RATE_LIMIT, (_TICKS, spec.action_dim))
     actions = np.clip(steps.cumsum(0), -1, 1)
@@ -74,8 +89,8 @@ def check_robot(robot: type[MujocoRobot] | str) -> RobotReport:
                 "the same actions; use only self.rng, and set everything in reset"
             )
     if spec.mirror is not None:
-        noisy = _play(kind(model), actions, 1)
-        mirrored = _play(kind(model), spec.mirrored_action(actions), 1)
+        noisy = _play(kind(copy(model)), actions, 1)
+        mirrored = _play(kind(copy(model)), spec.mirrored_action(actions), 1)
         _check_mirror(name, spec.state_names, run[0], noisy[0], spec.mirrored_state(mirrored[0]))
         off = _difference(run[1], mirrored[1][..., ::-1])
         if off > 2 * _difference(run[1], noisy[1]) + 0.02 * 1000 * spec.depth_max_m:

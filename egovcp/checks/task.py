@@ -56,7 +56,6 @@ def check_task(
         UsageError: the task is unknown.
         EnvironmentFailure: the task is defective: its scene does not compile, or a reward is NaN.
     """
-    from egovcp.sim.base_env import reporting_plugin_errors
     from egovcp.sim.config import evaluation_config
     from egovcp.sim.policies import Hold, Oracle, RandomWalk
     from egovcp.sim.robot_env import make_env
@@ -67,8 +66,7 @@ def check_task(
     name = register_task(task) if ":" in task else task
     kind = find_task(name)
     if issubclass(kind, RobotTask):
-        with reporting_plugin_errors():
-            check_robot(kind.robot_class)
+        check_robot(kind.robot_class)
     scenarios = [Scenario(name, CHECK_SEED + seed, i) for i in range(episodes)]
     with closing(make_env(config or evaluation_config(), episodes, [name])) as env:
         try:

@@ -14,10 +14,10 @@ from tqdm import tqdm
 
 from egovcp import spec
 from egovcp.data import schema
+from egovcp.data.camera_images import camera_images
 from egovcp.data.episode import Episode
-from egovcp.data.features import Feature, values_of
+from egovcp.data.features import Feature, nonfinite_problem, values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, is_own
-from egovcp.data.pictures import camera_images
 from egovcp.data.provenance import Provenance
 from egovcp.data.source import Source, select_episodes
 from egovcp.data.writer import DatasetWriter
@@ -77,6 +77,7 @@ def convert_dataset(
                 "features": {name: feature.key for name, feature in chosen.items()},
             }
         },
+        origin="converted",
     )
     columns = [f.key for f in chosen.values() if f.dtype != "video"]
     with DatasetWriter(root, origin) as writer, tqdm(total=len(rows), desc="convert") as bar:
@@ -237,11 +238,11 @@ def _episode(
 
 def _numbers(table: pa.Table, feature: Feature) -> NDArray[np.float64]:
     """(T, n) finite values; raises `DataError` with `frame` set."""
-    values = values_of(table[feature.key], feature).astype(np.float64)
-    finite = np.isfinite(values).all(1)
-    if not finite.all():
-        raise DataError.without_place(f"{feature.key} is not finite", int(np.argmin(finite)))
-    return values
+    values = values_of(table[feature.key], feature)
+    if found := nonfinite_problem(values, feature):
+        frame, problem = found
+        raise DataError.without_place(problem, frame)
+    return values.astype(np.float64)
 
 
 def _depth(image: NDArray[Any], robot: RobotSpec) -> NDArray[np.uint16]:

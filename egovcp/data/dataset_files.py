@@ -1,4 +1,4 @@
-"""All disk writes of datasets, so that tests can simulate disk failures."""
+"""Disk writes of dataset files, so that tests can simulate disk failures."""
 
 from __future__ import annotations
 

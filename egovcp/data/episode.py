@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -41,6 +42,12 @@ def frame_layout(robot: RobotSpec) -> Mapping[str, FrameLayout]:
         "reward_terms": ((len(spec.REWARD_TERMS),), np.float32),
         "object": ((spec.OBJECT_DIM,), np.float32),
     }
+
+
+def frame_bytes(robot: RobotSpec) -> int:
+    """Bytes of the arrays of a frame."""
+    layout = frame_layout(robot).values()
+    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in layout)
 
 
 #: Frame layout of the G1.

@@ -93,12 +93,23 @@ def values_of(column: pa.ChunkedArray, feature: Feature) -> NDArray[Any]:
             raise SchemaError.without_place(problem, at // per_frame)
         per_frame, levels, array = per_frame * want, levels + 1, array.flatten()
     if levels != len(feature.shape) and (levels, feature.size) != (0, 1):
-        problem = f"{key} holds single values, but its shape is {list(feature.shape)}"
+        given = f"holds lists nested {levels} deep" if levels else "holds single values"
+        problem = f"{key} {given}, but its shape is {list(feature.shape)}"
         raise SchemaError.without_place(problem, 0)
     if _kind(array.type) != _kind_of(feature.dtype):
         problem = f"{key} holds {array.type}, but its dtype is {feature.dtype}"
         raise SchemaError.without_place(problem, 0)
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(frames, per_frame)
+
+
+def nonfinite_problem(values: NDArray[Any], feature: Feature) -> tuple[int, str] | None:
+    """Frame and description of the first NaN or infinity in the values (T, n) of a feature; None if
+    all are finite."""
+    if values.dtype.kind != "f" or (finite := np.isfinite(values)).all():
+        return None
+    at = int(np.argmin(finite.all(1)))
+    index = int(np.argmin(finite[at]))
+    return at, f"{feature.label(index)} is {values[at, index]}, expected a finite number"
 
 
 def _is_list(kind: pa.DataType) -> bool:

@@ -37,10 +37,12 @@ class Mix:
 
     def check(self) -> None:
         """Raise `UsageError` for invalid weights."""
-        weights = [*self.datasets, *self.tasks.values()]
-        wrong = [weight for weight in weights if not (weight >= 0 and math.isfinite(weight))]
-        if wrong:
-            raise UsageError(f"a weight of {wrong[0]}: expected a finite number of at least 0")
+        given = {"--datasets": self.datasets, "--sampling.tasks": self.tasks.values()}
+        for flag, weights in given.items():
+            for weight in weights:
+                if not (weight >= 0 and math.isfinite(weight)):
+                    expected = "expected a finite number of at least 0"
+                    raise UsageError(f"{flag}: a weight of {weight}: {expected}")
 
     def as_dict(self) -> dict[str, Any]:
         return {"datasets": list(self.datasets), "tasks": dict(sorted(self.tasks.items()))}
@@ -61,7 +63,8 @@ def group_episodes(
     for task in mix.tasks:
         if task not in tasks:
             raise UsageError(
-                f"a weight for task {task!r}, of which there is no episode{suggest(task, {*tasks})}"
+                f"--sampling.tasks: no training episode is of task {task!r}"
+                f"{suggest(task, {*tasks})}"
             )
     if mix.datasets and len(mix.datasets) <= dataset.max():
         raise UsageError(f"{len(mix.datasets)} weights for {dataset.max() + 1} datasets")
@@ -76,7 +79,9 @@ def group_episodes(
         share *= np.array([mix.datasets[d] / frames[d] for d, _ in keys])
     share *= np.array([mix.tasks.get(task, 1.0) for _, task in keys])
     if not share.sum() > 0:
-        raise UsageError("the weights of datasets and tasks leave no episode to draw")
+        raise UsageError(
+            "the weights of datasets and tasks leave no episode to draw; give one more than 0"
+        )
     return EpisodeGroups(of, share / share.sum())
 
 

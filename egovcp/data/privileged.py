@@ -16,9 +16,10 @@ from egovcp import spec
 _EVENTS: Final = [i for i, name in enumerate(spec.REWARD_TERMS) if name not in spec.ACTION_TERMS]
 _OLDEST_S: Final = 2.0
 DIM: Final = 8 + len(_EVENTS)
-"""Position (3) when the object was last known, m; velocity (3) then, m/s; whether it is known now;
+"""Position (3) when the object was last known, m; its rate (3) then, m/s; whether it is known now;
 seconds since then, at most 2; sums (4) of the earlier rewards of the episode for each term but
-those of `spec.ACTION_TERMS`."""
+those of `spec.ACTION_TERMS`. The rate is that of the position in the moving heading frame: of the
+object relative to the robot, also while the robot turns."""
 _SIGN: Final = np.array([1, -1, 1, 1, -1, 1, *[1] * (DIM - 6)], np.float32)
 
 

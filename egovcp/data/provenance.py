@@ -27,6 +27,9 @@ class Provenance:
     """Installed version of each package on which the data depends."""
     config: Mapping[str, Any] = field(default_factory=dict)
     """Complete configuration of the simulator and the behaviour policy."""
+    origin: str = ""
+    """``simulated``, ``recorded`` (rollouts) or ``converted`` (another LeRobot dataset); empty:
+    unknown, as in datasets of earlier versions."""
 
 
 def parse_provenance(content: object, path: str | Path, where: str = "") -> Provenance:
@@ -42,7 +45,7 @@ def parse_provenance(content: object, path: str | Path, where: str = "") -> Prov
         raise DataError.at(path, f"{where}holds a {kind}, expected an object")
     if not isinstance(content.get("controller_id"), str) or not content["controller_id"]:
         raise DataError.at(path, f"{where}names no low-level controller")
-    types = {"seed": int | None, "command": str, "config": dict, "versions": dict}
+    types = {"seed": int | None, "command": str, "config": dict, "versions": dict, "origin": str}
     for key, expected in types.items():
         value = content.get(key)
         if key in content and (isinstance(value, bool) or not isinstance(value, expected)):
@@ -102,7 +105,7 @@ class ScenarioKey(NamedTuple):
 
 def _scenario_settings(origin: Provenance) -> str:
     """JSON of the settings on which a scenario depends besides task, seed and number."""
-    settings = asdict(replace(origin, command="", seed=None))
+    settings = asdict(replace(origin, command="", seed=None, origin=""))
     env = settings["config"].get("env")
     if isinstance(env, dict):  # may name the controller by a path; controller_id identifies it
         settings["config"]["env"] = {k: v for k, v in env.items() if k != "controller"}

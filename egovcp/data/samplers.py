@@ -32,11 +32,11 @@ NO_WEIGHTS: Final = Mix()
 class SamplerConfig:
     """How windows are drawn."""
 
-    batch_size: int = 16
+    batch_size: int = bounded(16, least=1)
     """Windows per batch, B."""
-    length: int = 48
+    length: int = bounded(48, least=1)
     """Rows of each window for which losses are computed."""
-    burn_in: int = 0
+    burn_in: int = bounded(0, least=0)
     """Rows before them that only warm up the memory: valid only where the episode starts."""
     mirror: bool = True
     """Reflect half of the windows left to right."""
@@ -44,11 +44,7 @@ class SamplerConfig:
     """Seed of all draws."""
 
     def check(self) -> None:
-        if self.batch_size < 1 or self.length < 1 or self.burn_in < 0:
-            raise UsageError(
-                f"batch_size {self.batch_size}, length {self.length}, burn_in {self.burn_in}: "
-                "expected at least 1, 1 and 0"
-            )
+        check_bounds(self)
 
     @property
     def span(self) -> int:
@@ -62,7 +58,7 @@ class ShuffleConfig:
 
     episodes: int = bounded(128, least=1, most=1_000_000)
     """Episodes in memory, about 1 MB each."""
-    reuse: float = bounded(1.0, above=0)
+    reuse: float = bounded(1.0, least=0.01)
     """How often the rows of an episode are used, on average, before it is replaced."""
 
     def check(self) -> None:
@@ -111,7 +107,9 @@ class InMemorySampler:
         """Continue from the state of a sampler with the same episodes and configuration."""
         _require_same_episodes(state, self._fingerprint)
         if "held" in state:
-            raise UsageError("cannot resume in memory: the run has streamed its data")
+            raise UsageError(
+                "cannot resume in memory: the run has streamed its data; use --loading.mode=stream"
+            )
         _require_same_options(state["config"], vars(self.config))
         _require_same_options(state.get("mix", NO_WEIGHTS.as_dict()), self.mix.as_dict())
         self._rng.bit_generator.state = state["rng"]
@@ -195,7 +193,9 @@ class StreamingSampler:
         """Continue from the state of a sampler with the same episodes and configuration."""
         _require_same_episodes(state, self.index.fingerprint)
         if "held" not in state:
-            raise UsageError("cannot resume by streaming: the run had its data in memory")
+            raise UsageError(
+                "cannot resume by streaming: the run had its data in memory; use --loading.mode=ram"
+            )
         _require_same_options(state["config"], self._options())
         self._rng.bit_generator.state = state["rng"]
         self._order.load_state_dict(state["order"])
@@ -309,11 +309,17 @@ def _finish(
 
 def _require_same_episodes(state: Mapping[str, Any], fingerprint: str) -> None:
     if state["fingerprint"] != fingerprint:
-        raise DataError("cannot resume the data stream: the dataset's episodes have changed")
+        raise DataError(
+            "cannot resume the data stream: the dataset's episodes have changed; restore the "
+            "dataset, or start a new run"
+        )
 
 
 def _require_same_options(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise `UsageError` unless a resumed sampler has the options of the saved one."""
     changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
     if changed:
-        raise UsageError(f"cannot resume the data stream with {', '.join(changed)}")
+        raise UsageError(
+            f"cannot resume the data stream with {', '.join(changed)}; give the options of the "
+            "run, or start a new one"
+        )

@@ -202,8 +202,12 @@ class StagingDir:
 
 
 def _read(path: Path) -> EncodedEpisode | None:
-    """The episode in a staged file; None if the content does not have the hash in its name."""
+    """The episode in a staged file; None if its content has not the hash in the name, or is none of
+    this version."""
     match = _NAME.fullmatch(path.name)
     if match is None or sha256(path) != match[2]:
         return None
-    return from_buffer(pa.memory_map(str(path)).read_buffer())
+    try:
+        return from_buffer(pa.memory_map(str(path)).read_buffer())
+    except DataError:
+        return None

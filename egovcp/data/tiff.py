@@ -94,7 +94,7 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
 @contextmanager
 def open_image(
     blob: bytes,
-    frame: int,
+    frame: int | None,
     name: str,
     kind: str = "an image",
     formats: tuple[str, ...] | None = None,

@@ -1,5 +1,6 @@
-"""Writes LeRobot v3.0 datasets straight to parquet: `DatasetWriter` at once, versions in steps.
+"""Writes LeRobot v3.0 datasets.
 
+`DatasetWriter` writes one in one go; `VersionWriter` writes the next version of a growing one.
 A published folder never changes; it is replaced by its next version, which shares the files of
 complete shards with the one before (hard links) and adds new shards and a new ``meta``. Its content
 depends on its episodes and provenance alone, not on the number of versions before it. A shard is
@@ -172,6 +173,7 @@ class VersionWriter:
                 dataset_files.link(path, self.folder / path.name)
             elif path.name not in ("data", "meta"):
                 shutil.copytree(path, self.folder / path.name)
+                dataset_files.sync_tree(self.folder / path.name)
 
     @property
     def episodes(self) -> int:
@@ -326,7 +328,11 @@ def _exchange(folder: Path, root: Path) -> None:
             raise
         aside = aside_folder(folder)  # `recover` completes the three renames after a crash
         dataset_files.rename(root, aside)
-        dataset_files.rename(folder, root)
+        try:
+            dataset_files.rename(folder, root)
+        except OSError:
+            dataset_files.rename(aside, root)
+            raise
         dataset_files.rename(aside, folder)
 
 

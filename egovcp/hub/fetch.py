@@ -105,6 +105,7 @@ def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
     Raises:
         EnvironmentFailure: the Hub cannot be reached, refuses, or sends a file that differs from
             its list; that file is removed, so that the next call downloads it again.
+        DataError: the commit does not exist, or holds a path outside the dataset.
     """
     listing = call_hub(partial(_download, repo_id, commit, folder), retry, repo_id, commit)
     for name, file in listing.items():

@@ -186,8 +186,8 @@ class _Publisher:
         self._api.create_repo(**self._repo, private=private or None, exist_ok=True)
         if private and not self._api.repo_info(**self._repo).private:
             raise UsageError(
-                f"{self._wanted.repo_id} exists and is public, but --private was given; nothing "
-                "was published; make it private on the Hub, or choose another id"
+                f"{self._wanted.repo_id} exists and is public, but a private repository was asked "
+                "for; nothing was published; make it private on the Hub, or choose another id"
             )
         if branch != _MAIN:
             self._api.create_branch(**self._repo, branch=branch, exist_ok=True)

@@ -33,6 +33,7 @@ QUEUE_TICKS: Final = 300  # 12 s at 25 Hz: a disk may hang for 10 s without loss
 START_TIMEOUT_S: Final = 60.0
 CLOSE_TIMEOUT_S: Final = 10.0
 _KILL_TIMEOUT_S: Final = 1.0  # a process that waits for a disk does not end on SIGKILL
+_EXIT_CODE_TIMEOUT_S: Final = 1.0  # from the end of the pipe to that of the process
 
 
 def warn_on_stderr(line: str) -> None:
@@ -140,7 +141,7 @@ class AsyncSink:
         end = time.monotonic() + timeout_s
         while self.failure is None and not ready() and (left := end - time.monotonic()) > 0:
             self._process.wait(left)
-            self._pump(_KILL_TIMEOUT_S)
+            self._pump(_EXIT_CODE_TIMEOUT_S)
 
     def _pump(self, exit_wait_s: float = 0.0) -> None:
         """Exchange bytes with the process without blocking; if it has closed a pipe, wait at most
@@ -178,7 +179,9 @@ class AsyncSink:
                 f"{self.lost} more may be missing at its end{unfinished}"
             )
         elif self._opened and not self._closed:
-            self._warn(f"{self.name}: not finished in time; it has every tick but no index")
+            self._warn(
+                f"{self.name}: not finished within {self._close_timeout_s:g} s; it is incomplete"
+            )
 
 
 class AsyncFanout(Fanout[AsyncSink]):

@@ -85,9 +85,7 @@ def _title(signal: str) -> str:
 
 
 def _blueprint(root: rrb.Container) -> rrb.Blueprint:
-    time = rrb.TimePanel(
-        state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
-    )
+    time = rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="all")
     return rrb.Blueprint(root, time, collapse_panels=True)
 
 

@@ -27,7 +27,7 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.files import sync
 from egovcp.log.messages import Topic, encode_tick, message_type
 from egovcp.log.ros2 import definition
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import RunInfo, Tick, existing_file_error
 
 SYNC_PERIOD_S: Final = 1.0
 METADATA_NAME: Final = "egovcp"
@@ -82,9 +82,7 @@ class McapFile:
         try:
             self._file = self._path.open("xb")
         except FileExistsError as error:
-            raise EnvironmentFailure(
-                f"{self._path} exists already; recordings are never overwritten: choose another"
-            ) from error
+            raise existing_file_error(self._path) from error
         except FileNotFoundError as error:
             raise EnvironmentFailure(f"{self._path} is in a folder that does not exist") from (
                 error

@@ -206,11 +206,20 @@ def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
         messages[Topic.TIMING] = _named(dict(tick.timing_ms))
     if tick.scene:
         rows = [(*o.position_w, *o.quaternion_w, *o.size) for o in tick.scene]
-        names = ",".join(f"{o.name}:{o.shape}" for o in tick.scene)
+        names = ",".join(f"{_escaped(o.name)}:{o.shape}" for o in tick.scene)
         messages[Topic.SCENE] = ros2.multi_array(rows, [names, "x,y,z,qw,qx,qy,qz,sx,sy,sz"])
     if tick.events:
         messages[Topic.LOG] = ros2.log_line(tick.time_ns, "\n".join(tick.events))
     return messages
+
+
+def _escaped(name: str) -> str:
+    """A name without the separators of a label; the inverse is `_unescaped`."""
+    return name.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
+
+
+def _unescaped(name: str) -> str:
+    return name.replace("%2C", ",").replace("%3A", ":").replace("%25", "%")
 
 
 def _named(scalars: dict[str, float]) -> bytes:
@@ -357,5 +366,5 @@ def _scene(message: Any) -> tuple[Solid, ...]:
     for (name, shape), row in zip(names, _array(message), strict=True):
         x, y, z = row[7:].tolist()
         kind: Literal["sphere", "box"] = "sphere" if shape == "sphere" else "box"
-        scene.append(Solid(name, kind, (x, y, z), row[:3], row[3:7]))
+        scene.append(Solid(_unescaped(name), kind, (x, y, z), row[:3], row[3:7]))
     return tuple(scene)

@@ -30,7 +30,7 @@ from egovcp.log.rerun_columns import (
     skeleton_columns,
 )
 from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
-from egovcp.log.tick import CameraView, RunInfo, Tick
+from egovcp.log.tick import CameraView, RunInfo, Tick, existing_file_error
 from egovcp.log.viewer import Viewer
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, Solid
@@ -152,9 +152,7 @@ class RerunSink:
 
 def _create_file(path: Path, stream: rr.RecordingStream, layout: rrb.Blueprint) -> None:
     if path.exists():
-        raise EnvironmentFailure(
-            f"{path} exists already; recordings are never overwritten: choose another"
-        )
+        raise existing_file_error(path)
     try:
         stream.save(path, default_blueprint=layout)
     except RuntimeError as error:  # Rerun has no other type for it

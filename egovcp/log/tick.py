@@ -7,21 +7,35 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.decode import decode
+from egovcp.errors import EnvironmentFailure
 from egovcp.files import check_depth
 from egovcp.robot.geometry import focal_length
 from egovcp.robot_spec import G1, ROBOT_KEY, RobotSpec
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, SPEC_VERSION, Solid
+from egovcp.spec import (
+    CAMERA_PITCH_RANGE,
+    CAMERA_POSITION,
+    CAMERA_VERTICAL_FOV,
+    DEPTH_COLS,
+    DEPTH_ROWS,
+    PLANNER_HZ,
+    SPEC_VERSION,
+    Solid,
+)
 
 Array = NDArray[np.floating]
 
 #: States of the runner of a robot.
 MODES: Final = ("init", "stand", "armed", "run", "hold", "damp")
+#: Key of `RunInfo.hashes` that names the low-level controller.
+CONTROLLER: Final = "low_level_controller"
 type Hand = Literal["left", "right"]
 
 
@@ -129,15 +143,23 @@ class Tick:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A pinhole depth camera fixed to a link, looking along that link's x axis."""
+    """A pinhole depth camera fixed to a link, looking along that link's x axis; by default the
+    simulated camera of the G1.
+
+    Raises:
+        UsageError: a number is not finite or out of bounds.
+    """
 
     link: str = "torso_link"
-    position: tuple[float, float, float] = (0.06, 0.0, 0.43)
+    position: tuple[float, float, float] = CAMERA_POSITION
     """Optical centre in the link frame, m."""
-    pitch: float = math.radians(3.0)
+    pitch: float = sum(CAMERA_PITCH_RANGE) / 2
     """Downward tilt of the optical axis, rad."""
-    vertical_fov: float = math.radians(58.0)
+    vertical_fov: float = bounded(CAMERA_VERTICAL_FOV, above=0, below=math.pi)
     """Angle between the top and the bottom edge of the image, rad."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
     @property
     def focal_px(self) -> float:
@@ -210,8 +232,8 @@ class RunInfo:
             versions=value("versions", dict[str, str]),
             backend=record.get("backend", ""),  # absent in older recordings
         )
-        if info.fps <= 0 or not 0 < info.camera.vertical_fov < math.pi:
-            raise ValueError("expected fps > 0, and camera.vertical_fov between 0 and pi")
+        if info.fps <= 0:
+            raise ValueError("expected fps > 0")
         if ROBOT_KEY not in record:
             return info
         return replace(info, robot=RobotSpec.from_json(value(ROBOT_KEY, dict[str, Any])))
@@ -228,6 +250,14 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Complete the log on disk; further calls do nothing."""
+
+
+def existing_file_error(path: Path) -> EnvironmentFailure:
+    """What `Sink.open` raises if its file exists."""
+    return EnvironmentFailure(
+        f"{path} exists already; recordings are never overwritten: name another output, or remove "
+        "the file"
+    )
 
 
 class Fanout[S: Sink]:

@@ -125,7 +125,11 @@ class LiveRerun:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        self._await(ports)
+        try:
+            self._await(ports)
+        except BaseException:  # then `__exit__` is not called
+            self._end()
+            raise
         return self
 
     def __exit__(self, *details: object) -> None:
@@ -145,7 +149,6 @@ class LiveRerun:
             assert self._process is not None
             code = self._process.poll()
             if code is not None or time.monotonic() > end:
-                self._end()
                 how = "was not ready in time" if code is None else f"ended with code {code}"
                 raise EnvironmentFailure(
                     f"the Rerun viewer {how}; on a machine without a display use the web viewer, "

@@ -18,7 +18,7 @@ _LONGEST = 64
 
 ValueLoss = Literal["mse", "two_hot"]
 FreeNatsPer = Literal["step", "dimension"]
-Dynamics = Literal["joint", "autoregressive"]
+DynamicsLoss = Literal["joint", "autoregressive"]
 QTarget = Literal["privileged", "mc", "td"]
 
 
@@ -39,7 +39,7 @@ class LossConfig:
     proximity_threshold: float = bounded(0.7, least=0, most=1)
     """Nearness (1 at the camera, 0 at the end of the depth range) above which a pixel is near."""
     state: float = bounded(20.0, least=0)
-    """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
+    """Weight of the proprioception reconstruction, mean over the standardised values."""
     kl_prior: float = bounded(0.1, least=0)
     """Weight of KL(sg q || p), which trains the prior."""
     kl_posterior: float = bounded(0.01, least=0)
@@ -103,7 +103,7 @@ class WorldModelConfig:
     """Width of every MLP."""
     channels: tuple[int, int, int] = bounded((32, 64, 64), least=1, most=_MOST_CHANNELS)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
-    dynamics: Dynamics = "joint"
+    dynamics: DynamicsLoss = "joint"
     """joint: train prior and posterior by the KL terms of equation 8; autoregressive: feed
     predictions back for several steps and compare them with the observations (ARWM), no KL."""
     value_loss: ValueLoss = "mse"

@@ -1,7 +1,7 @@
 """The terms of the training objective (paper equations 6 to 9) over sequences [B, T, ...].
 
-Alignment of a row t: the model filters o_t after a_{t-1}; Q_t is fitted to the
-Monte Carlo return from t; D classifies the state that a_t has produced, (h_{t+1}, z^_{t+1}),
+Alignment of a row t: the model filters o_t after a_{t-1}; Q_t is fitted to the target of row t
+(`egovcp.model.value_losses`); D classifies the state that a_t has produced, (h_{t+1}, z^_{t+1}),
 because D has no action as input and the terminal observation is not stored.
 """
 
@@ -147,7 +147,7 @@ def depth_loss(
     every: int = 1,
     first: int = 0,
 ) -> Tensor:
-    """Gaussian negative log likelihood of every n-th image, pixels weighted.
+    """Half the squared error of every n-th image, weighted mean over its pixels.
 
     Args:
         valid: (B, T) bool, rows to average over.
@@ -162,7 +162,7 @@ def depth_loss(
 
 
 def first_image(every: int, batch: Batch, generator: torch.Generator | None) -> int:
-    """Random index of the first image that is decoded, below n."""
+    """Index below ``every`` of the first decoded image, random."""
     every = min(every, batch.valid.shape[1])
     return int(torch.randint(every, (), generator=generator, device=batch.valid.device))
 
@@ -198,14 +198,14 @@ def _changed(near: Tensor, threshold: float) -> Tensor:
 
 
 def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Gaussian negative log likelihood of the standardised proprioception."""
+    """Half the squared error of the standardised proprioception, mean over its values."""
     prediction = model.decode_state(rollout.carry.h, rollout.carry.z).float()
     error = 0.5 * (prediction - rollout.state).square().mean(-1)
     return masked_mean(error, batch.valid)
 
 
 def object_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Gaussian negative log likelihood of position and velocity of the task's object."""
+    """`object_error` of the rows where the object is known."""
     error = object_error(model, rollout.carry, batch.object)
     return masked_mean(error, batch.valid & batch.object_known)
 

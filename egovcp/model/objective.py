@@ -37,7 +37,7 @@ type TermGroup = Callable[[], Terms]
 class StepNoise(NamedTuple):
     """Random numbers of one training step."""
 
-    noise: Tensor  # (T, B, Z), noise of z
+    latent: Tensor  # (T, B, Z), noise of z
     image: int  # index of the first image that is decoded
     multistep: int  # first row from which `multistep_losses` imagines
     autoregressive: int  # the same for `autoregressive_losses`; 0 if unused
@@ -49,7 +49,7 @@ def sample_step_noise(
 ) -> StepNoise:
     """Sample for a batch of this shape; generator None: torch's default generator."""
     config = model.config.loss
-    noise = losses.latent_noise(model, batch, generator)
+    latent = losses.latent_noise(model, batch, generator)
     multistep = first_row(config, config.multistep_horizons, batch, generator)
     image = losses.first_image(config.decode_every, batch, generator)
     autoregressive = 0
@@ -57,7 +57,7 @@ def sample_step_noise(
         autoregressive = first_row(config, autoregressive_horizons(config), batch, generator)
     count = config.sampled_actions if config.q_target == "privileged" else 0
     actions = sample_actions(batch.prev_action, count, generator)
-    return StepNoise(noise, image, multistep, autoregressive, actions)
+    return StepNoise(latent, image, multistep, autoregressive, actions)
 
 
 def world_model_loss(
@@ -72,9 +72,10 @@ def world_model_loss(
         noise: random numbers, or the generator that samples them; None: torch's default generator.
         critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
     """
-    draws = noise if isinstance(noise, StepNoise) else sample_step_noise(model, batch, noise)
-    rollout = losses.filter_sequence(model, batch, draws.noise)
-    filtered, imagined = _term_groups(model, rollout, batch, draws, critic)
+    if not isinstance(noise, StepNoise):
+        noise = sample_step_noise(model, batch, noise)
+    rollout = losses.filter_sequence(model, batch, noise.latent)
+    filtered, imagined = _term_groups(model, rollout, batch, noise, critic)
     terms = filtered() | imagined()
     return _sum(terms), _named(terms)
 
@@ -82,7 +83,7 @@ def world_model_loss(
 def world_model_gradients(
     model: WorldModel,
     batch: Batch,
-    draws: StepNoise,
+    noise: StepNoise,
     critic: nn.Module | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms, Carry]:
@@ -92,13 +93,13 @@ def world_model_gradients(
     Never synchronises with a GPU.
 
     Args:
-        draws: random numbers of the step.
+        noise: random numbers of the step.
         critic: the network that predicts the target of Q (`egovcp.model.value_losses`).
         precision: context (autocast) of the losses, not of their gradients.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
     with precision():  # one outer context: leaving the last one clears autocast's weight cache
-        rollout = losses.filter_sequence(model, batch, draws.noise)
+        rollout = losses.filter_sequence(model, batch, noise.latent)
         leaves, outer, states = _detach(rollout)
 
         def with_gradient(group: TermGroup) -> tuple[Terms, list[Tensor | None]]:
@@ -112,7 +113,7 @@ def world_model_gradients(
                 gradients = torch.autograd.grad(total, inputs, allow_unused=True)
                 return terms, list(gradients)
 
-        filtered, imagined = _term_groups(model, leaves, batch, draws, critic)
+        filtered, imagined = _term_groups(model, leaves, batch, noise, critic)
         first, second = partial(with_gradient, filtered), partial(with_gradient, imagined)
         if batch.state.device.type == "cpu":
             (terms, gradients), (more, others) = run_parallel(first, second)
@@ -165,7 +166,7 @@ def _term_groups(
     model: WorldModel,
     rollout: Rollout,
     batch: Batch,
-    draws: StepNoise,
+    noise: StepNoise,
     critic: nn.Module | None,
 ) -> tuple[TermGroup, TermGroup]:
     """The terms of filtered states, and those of states imagined several steps ahead."""
@@ -174,7 +175,7 @@ def _term_groups(
 
     def filtered() -> Terms:
         every = config.decode_every
-        depth = losses.depth_loss(model, rollout, batch.valid, weight, every, draws.image)
+        depth = losses.depth_loss(model, rollout, batch.valid, weight, every, noise.image)
         terms = {
             "depth": config.depth * depth,
             "state": config.state * losses.state_loss(model, rollout, batch),
@@ -184,13 +185,13 @@ def _term_groups(
         if model.config.dynamics == "joint":
             terms |= losses.kl_losses(rollout, batch.valid, config)
         else:
-            terms |= autoregressive_losses(model, rollout, batch, weight, draws.autoregressive)
+            terms |= autoregressive_losses(model, rollout, batch, weight, noise.autoregressive)
         return terms | value_and_termination_losses(
-            model, rollout, batch, config, critic, draws.actions
+            model, rollout, batch, config, critic, noise.actions
         )
 
     def imagined() -> Terms:
-        return multistep_losses(model, rollout, batch, weight, draws.multistep)
+        return multistep_losses(model, rollout, batch, weight, noise.multistep)
 
     return filtered, imagined
 

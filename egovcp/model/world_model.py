@@ -10,8 +10,9 @@
 Leading dimensions of a carry broadcast against those of the action: a state evaluated under a
 thousand candidate actions is computed once.
 
-The recurrence is an explicit `Carry`: the same `observe` step serves training, filtering
-on the robot and replay; `imagine` advances it without an observation.
+The recurrence is an explicit `Carry`: `observe` filters on the robot and in replay, `imagine`
+advances without an observation. Training computes the same over whole windows
+(`egovcp.model.losses.filter_sequence`).
 """
 
 from __future__ import annotations
@@ -245,7 +246,7 @@ class WorldModel(nn.Module):
         return q * self.return_std + self.return_mean
 
     def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
-        """Loss of Q against the standardised return (...,), (...,)."""
+        """Loss (...,) of Q against a standardised target (...,)."""
         outputs = self.value_head(carry.h, carry.z, action)
         return value.error(outputs, target, self.config.value_loss)
 

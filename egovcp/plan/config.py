@@ -51,10 +51,10 @@ class PlannerConfig:
     eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
     """Largest action change per step, normalised action units ([-1, 1])."""
     action_rate_cost: float = bounded(spec.ACTION_RATE_COST, least=0, most=1e6)
-    """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step; that of the data's
-    reward."""
+    """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step; default: the
+    reward's."""
     pose_cost: float = bounded(spec.POSE_COST, least=0, most=1e6)
-    """Coefficient of mean(a_t^2) in the cost of a step; that of the data's reward."""
+    """Coefficient of mean(a_t^2) in the cost of a step; default: the reward's."""
     action_parameterization: ActionParameterization = "target"
     """How a sample becomes actions. target: move towards one target at rate eta, then hold it, like
     the default data of egovcp-collect; random_walk: an independent change at every step."""
@@ -86,11 +86,13 @@ class PlannerConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
         if self.elites > self.samples:
-            raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
+            raise UsageError(
+                f"planner.elites={self.elites} exceeds planner.samples={self.samples}; lower it"
+            )
 
     @property
     def actions(self) -> int:
-        """Actions of a candidate: N, and under ``objective=td`` one more, for Q at the end."""
+        """P, actions of a candidate: N, and under ``objective=td`` one more, for Q at the end."""
         return self.horizon + (self.objective == "td")
 
 

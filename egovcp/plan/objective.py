@@ -11,6 +11,7 @@ more action, which the search optimises.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -22,11 +23,17 @@ from egovcp.plan.config import PlannerConfig
 from egovcp.robot_spec import RobotSpec
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
-"""V (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
+"""V (E, M) of plans (E, M, P, 7), P = `PlannerConfig.actions`; the generator samples the noise
+under ``latent=sample``."""
 
 
 class PlanEvaluator[C](Protocol):
     """Evaluates plans from a state; all implementations compute the same up to rounding."""
+
+    @property
+    def backend(self) -> str:
+        """The value of `PlannerConfig.backend` that names it."""
+        ...
 
     def at(self, carry: C) -> PlanValue:
         """The evaluation of plans from the robots' states (E, ...)."""
@@ -46,8 +53,8 @@ class Dynamics[L](Protocol):
 
     @property
     def min_return(self) -> Tensor:
-        """The 0.1 % quantile of the returns of the data, the value of a failed plan under rule
-        ``shift``."""
+        """The 0.1 % quantile of the returns of the data, the value of a failed plan under the rules
+        ``shift`` and ``survival``."""
         ...
 
     def expand_candidates(self, carry: L) -> L:
@@ -67,11 +74,13 @@ class Dynamics[L](Protocol):
         ...
 
 
-class ReferenceEvaluator[L](NamedTuple):
+@dataclass(frozen=True)
+class ReferenceEvaluator[L]:
     """Evaluates plans with the world model step by step: slow, the reference of all backends."""
 
     model: Dynamics[L]
     config: PlannerConfig
+    backend = "eager"
 
     def at(self, carry: L) -> PlanValue:
         """See `PlanEvaluator`."""
@@ -98,6 +107,11 @@ class MirroredEvaluator(NamedTuple):
 
     evaluator: PlanEvaluator[Carry]
     robot: RobotSpec
+
+    @property
+    def backend(self) -> str:
+        """See `PlanEvaluator`."""
+        return self.evaluator.backend
 
     def at(self, carry: Carry) -> PlanValue:
         """See `PlanEvaluator`; plans are those of the E robots."""
@@ -176,7 +190,7 @@ def evaluate[L](
     config: PlannerConfig,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """V (E, M) of plans (E, M, A, 7) from the robots' carry (E, ...), A = `PlannerConfig.actions`.
+    """V (E, M) of plans (E, M, P, 7) from the robots' carry (E, ...), P = `PlannerConfig.actions`.
 
     Args:
         generator: of the noise under ``latent=sample``; None: torch's own.

@@ -15,7 +15,7 @@ from egovcp.plan.search import Optimiser, SearchState
 
 
 def draw(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
-    """(E, M, N, 7) deltas around a mean, from noise (1, M, N, 7).
+    """(E, M, P, 7) deltas around a mean, from noise (1, M, P, 7).
 
     The first candidate is the mean itself, the second is zero.
     """
@@ -27,12 +27,12 @@ def draw(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
 
 
 def white(mean: Tensor, samples: int, generator: torch.Generator) -> Tensor:
-    """Noise (1, M, N, 7) that all robots share."""
+    """Noise (1, M, P, 7) that all robots share."""
     return torch.randn((1, samples, *mean.shape[1:]), generator=generator, device=mean.device)
 
 
 def best_of(deltas: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """The ``count`` best of (E, M, N, 7) by their values (E, M), best first."""
+    """The ``count`` best of (E, M, P, 7) by their values (E, M), best first."""
     top, index = values.topk(count, dim=1)
     rows = deltas.flatten(2)
     best = rows.gather(1, index[:, :, None].expand(-1, -1, rows.shape[2]))
@@ -58,7 +58,7 @@ class CrossEntropy:
 
 
 def refit(elites: Tensor, usable: Tensor, state: SearchState) -> tuple[Tensor, Tensor]:
-    """Mean and deviation (E, N, 7) of the usable elites (E, elites, N, 7); without any, the old."""
+    """Mean and deviation (E, P, 7) of the usable elites (E, elites, P, 7); without any, the old."""
     weight = usable[:, :, None, None].to(elites.dtype)
     count = weight.sum(1)
     fitted = (elites * weight).sum(1) / count.clamp_min(1.0)
@@ -83,7 +83,7 @@ class KernelCrossEntropy:
 
     def __init__(self, config: PlannerConfig) -> None:
         self.config = config
-        self._kernel = library.library()
+        self._kernel = library.load_kernel()
 
     def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         mean, std = state.mean.contiguous(), state.std.contiguous()
@@ -151,7 +151,7 @@ def keep_best(state: SearchState, elites: Tensor, top: Tensor) -> SearchState:
 
 
 def coloured(mean: Tensor, samples: int, exponent: float, generator: torch.Generator) -> Tensor:
-    """Noise (1, M, N, 7) of unit variance whose power falls as f^-exponent along the plan."""
+    """Noise (1, M, P, 7) of unit variance whose power falls as f^-exponent along the plan."""
     horizon, actions = mean.shape[1:]
     length = max(2 * horizon, 2)  # twice as long, so that the noise is not periodic
     power = torch.fft.rfftfreq(length, device=mean.device).clamp_min(1.0 / length) ** -exponent
@@ -242,4 +242,4 @@ def optimiser_of(config: PlannerConfig, device: torch.device | str = "cpu") -> O
 
 
 def _kernel_is_available() -> bool:
-    return library.processor_is_fast() and library.library_if_possible() is not None
+    return library.processor_is_fast() and library.load_kernel_if_possible() is not None

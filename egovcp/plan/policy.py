@@ -30,13 +30,16 @@ _NONE: Final[Array] = np.zeros(0, np.float32)
 
 
 class PolicyStep(NamedTuple):
-    """Result of a planner step for E robots; fields that a policy does not compute are empty."""
+    """Result of a planner step for E robots; fields that a policy does not compute are empty.
+
+    P is `PlannerConfig.actions`.
+    """
 
     action: Array  # (E, 7) in [-1, 1]
-    plan: Array = _NONE  # (E, N, 7)
+    plan: Array = _NONE  # (E, P, 7)
     value: Array = _NONE  # (E,) J of the plan
     termination: Array = _NONE  # (E,) probability at the filtered state
-    candidates: Array = _NONE  # (E, elites, N, 7), best first
+    candidates: Array = _NONE  # (E, elites, P, 7), best first
     candidate_values: Array = _NONE  # (E, elites)
     iterations: int = 0
     skipped: NDArray[np.bool_] = np.zeros(0, np.bool_)  # (E,) see `Policy.skipped`
@@ -193,8 +196,14 @@ class Policy:
         """Set the action (E, 7) that was sent, for the recurrence.
 
         Raises:
-            UsageError: it is not finite.
+            UsageError: another shape, or it is not finite.
         """
+        expected = (self.num_envs, self.model.robot.action_dim)
+        if np.shape(sent) != expected:
+            raise UsageError(
+                f"actions that were sent {np.shape(sent)}: expected {expected}, for "
+                f"{self.num_envs} robots"
+            )
         if not np.isfinite(sent).all():
             raise UsageError("the action that was sent is not finite; report what the robot took")
         self._sent = torch.from_numpy(np.array(sent, np.float32)).to(self._device)
@@ -216,7 +225,7 @@ class Policy:
 
     @torch.inference_mode()
     def imagine(self, plan: NDArray[np.floating], horizon: int) -> Array:
-        """Depth (E, horizon, 48, 64), metres, imagined under ``plan`` (E, N, 7).
+        """Depth (E, horizon, 48, 64), metres, imagined under ``plan`` (E, P, 7).
 
         Beyond the plan's end its last action is held.
         """

@@ -1,7 +1,8 @@
 """Value-guided sampling MPC (paper section III-D): sample plans, evaluate them, refine the samples.
 
 Candidates change by at most eta per step from the last executed action, a_k = a_{k-1} + eta *
-delta_k with delta in [-1, 1]^A. A search has no side effects and reads no clock but ``remaining``.
+delta_k with delta in [-1, 1]^7. A search has no side effects and reads no clock but ``remaining``.
+P in shapes is `PlannerConfig.actions`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def reflect_once(x: Tensor) -> Tensor:
 
 
 def random_walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Actions (..., N, 7) of a random walk from ``start`` (..., 7) by ``deltas``."""
+    """Actions (..., P, 7) of a random walk from ``start`` (..., 7) by ``deltas``."""
     actions = []
     action = start
     for delta in deltas.unbind(-2):
@@ -34,9 +35,9 @@ def random_walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
 
 
 def target_deltas(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Deltas (..., N, 7) that move from ``start`` (..., 7) to one target at rate ``eta``, and hold.
+    """Deltas (..., P, 7) that move from ``start`` (..., 7) to one target at rate ``eta``, and hold.
 
-    The target is where ``deltas`` (..., N, 7) add up to, reflected into the box. Deltas that are
+    The target is where ``deltas`` (..., P, 7) add up to, reflected into the box. Deltas that are
     already of this kind are returned unchanged.
     """
     target = reflect_once((start + eta * deltas.sum(-2)).clamp(-3.0, 3.0))
@@ -46,18 +47,18 @@ def target_deltas(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
 
 
 def shift(deltas: Tensor) -> Tensor:
-    """The warm start: deltas (E, N, 7) without the first, which was executed, and a zero step."""
+    """The warm start: deltas (E, P, 7) without the first, which was executed, and a zero step."""
     return torch.cat([deltas[:, 1:], torch.zeros_like(deltas[:, :1])], 1)
 
 
 class SearchState(NamedTuple):
     """State of a search for E robots."""
 
-    mean: Tensor  # (E, N, 7) deltas of the current result
-    std: Tensor  # (E, N, 7)
-    elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last iteration
+    mean: Tensor  # (E, P, 7) deltas of the current result: a mean, or the best plan so far
+    std: Tensor  # (E, P, 7)
+    elites: Tensor  # (E, elites, P, 7) deltas, best first; of the last iteration
     values: Tensor  # (E, elites); -inf where J was not finite
-    value: Tensor  # (E,) J of the result, as far as known
+    value: Tensor  # (E,) mean J of the candidates that ``mean`` is made of; -inf: not known
 
 
 class Optimiser(Protocol):
@@ -67,7 +68,7 @@ class Optimiser(Protocol):
     """
 
     def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
-        """(E, M, N, 7) deltas; the first candidate is ``state.mean`` in iteration 0."""
+        """(E, M, P, 7) deltas; the first candidate is ``state.mean`` in iteration 0."""
         ...
 
     def update(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
@@ -78,10 +79,10 @@ class Optimiser(Protocol):
 class Plan(NamedTuple):
     """Result of a search for E robots."""
 
-    actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
-    deltas: Tensor  # (E, N, 7) its deltas; shifted, the warm start of the next plan
-    value: Tensor  # (E,) J (cem: mean of the elites); -inf: none finite
-    candidates: Tensor  # (E, elites, N, 7) elites of the last iteration, best first
+    actions: Tensor  # (E, P, 7) in [-1, 1]; the first is to be executed
+    deltas: Tensor  # (E, P, 7) its deltas; shifted, the warm start of the next plan
+    value: Tensor  # (E,) see `SearchState`
+    candidates: Tensor  # (E, elites, P, 7) elites of the last iteration, best first
     candidate_values: Tensor  # (E, elites); -inf where J was not finite
     iterations: int
 
@@ -108,7 +109,7 @@ def make_plan[C](
     Q does not learn.
 
     Args:
-        warm: (E, N, 7) deltas of the previous plan, already shifted; None: zeros.
+        warm: (E, P, 7) deltas of the previous plan, already shifted; None: zeros.
         generator: of the samples, which all robots share: a robot's plan does not depend on the
             other robots.
         remaining: seconds until the result is due. The search stops if another iteration, as long
@@ -122,7 +123,7 @@ def make_plan[C](
     walk = getattr(optimiser, "random_walk", random_walk)
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
-        deltas = optimiser.propose(state, iteration, generator)  # (E, M, N, 7)
+        deltas = optimiser.propose(state, iteration, generator)  # (E, M, P, 7)
         if config.action_parameterization == "target":
             deltas = target_deltas(start, deltas, config.eta)
         actions = walk(start, deltas, config.eta)

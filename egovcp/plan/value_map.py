@@ -1,6 +1,6 @@
-"""Value of the planned action with one hand moved over its x-z plane (fig. 7a).
+"""J of the planned action with one hand moved over its x-z plane (fig. 7a).
 
-    V(z, x) = Q(h_t, z_t, a') - C(a'),  a' = a with its hand at (x, z)
+    J(z, x) = Q(h_t, z_t, a') - C(a'),  a' = a with its hand at (x, z)
 
 with a the planned action and C the planner's cost of holding a pose; Q does not contain it. Q was
 fitted to actions that the rate limit allows after the last one.

@@ -70,7 +70,8 @@ _MAX_ERROR: Final = 0.08  # m per iteration: the step is linear
 _REST_PULL: Final = 0.25
 REACH: Final = 0.45  # m, shoulder to palm; a straight arm is 0.465
 _TRUNK_RADII: Final = (0.16, 0.15)  # m, keep-out ellipse around the trunk: forward, sideways
-#: Of the controller: all constants above.
+#: Part of the controller's identity: what can be tuned. The kinematics and the bounds of targets
+#: are not in it; ``tests/egovcp/robot/test_kinematics.py`` says when they need a new identity.
 IDENTITY: Final = (
     REST.tolist(),
     _SHARE.tolist(),

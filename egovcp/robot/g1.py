@@ -67,8 +67,9 @@ M7520_22: Final = Motor((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0), 139.0, 20.0)
 M4010: Final = Motor((0.068e-4, 0.0, 0.0), (5.0, 5.0), 5.0, 22.0)
 
 #: Joint name without side and `_joint` -> motor type, number of motors, gains (kp N m/rad, kd N m
-#: s/rad) or None for the published ones, with which hands lag 6-8 cm behind the random walk. Ankles
-#: and the roll and pitch of the waist are four-bar linkages with two motors, taken as 1:1.
+#: s/rad; None: the published ones). Arms have higher gains than the published ones, with which the
+#: hands lag 6-8 cm behind the random walk. Ankles and the roll and pitch of the waist are four-bar
+#: linkages with two motors, taken as 1:1.
 _ACTUATORS: Final[dict[str, tuple[Motor, int, tuple[float, float] | None]]] = {
     "hip_pitch": (M7520_14, 1, None),
     "hip_roll": (M7520_22, 1, None),

@@ -1,11 +1,11 @@
 """The gait: a clock, footholds by the capture point, and leg motion.
 
 The phase phi runs from 0 to 2 pi in one stride: the left foot swings while sin phi > 0, the
-right one while sin phi < 0. ``amount`` is the share of the gait that is blended into standing.
+right one while sin phi < 0. ``blend`` is the share of the gait that is blended into standing.
 The robot steps if a velocity is commanded, or if it is about to fall.
 
 The swinging foot aims where a linear inverted pendulum of the pelvis's height is captured: at
-touchdown its extrapolated centre of mass xi = v / omega lies beside the foothold by
+touchdown its extrapolated centre of mass xi = x + v / omega lies beside the foothold by
 a constant offset that keeps the commanded speed and the stance width (Hof, "The 'extrapolated
 center of mass' concept suggests a simple control of balance in walking", Human Movement
 Science 27, 2008). The stance leg carries the weight (its share of the static torques is fed
@@ -67,21 +67,23 @@ class GaitConfig:
     hip_moment: float = 15.0
     """N m about the standing hip that hold up the other side of the pelvis."""
     hip_pitch: tuple[float, float] = (1.73, 0.114)
-    """rad per rad and per rad/s of the pelvis's pitch, standing leg."""
+    """Gains of the stance hip's pitch: rad per rad of pelvis pitch, rad per rad/s of its rate."""
     hip_roll: tuple[float, float] = (1.5, 0.194)
-    """rad per rad and per rad/s of its roll."""
+    """Gains of the stance hip's roll: rad per rad of pelvis roll, rad per rad/s of its rate."""
     hip_yaw: tuple[float, float] = (0.403, 0.299)
-    """rad per rad and per rad/s off the commanded turn."""
+    """Gains of the stance hip's yaw: rad per rad of heading error, rad per rad/s of its rate."""
     ankle_pitch: tuple[float, float, float, float] = (2.09, 0.251, 3.25, 0.349)
-    """rad per rad and rad/s of pitch, per m ahead of the foot, per m/s off the command."""
+    """Gains of the stance ankle's pitch: rad per rad of pelvis pitch, per rad/s of its rate, per m
+    of the pelvis ahead of the foot, per m/s of error of the forward velocity."""
     ankle_roll: tuple[float, float, float] = (1.17, 0.141, -0.466)
-    """rad per rad and rad/s of roll, per m/s off the command."""
+    """Gains of the stance ankle's roll: rad per rad of pelvis roll, per rad/s of its rate, per m/s
+    of error of the sideways velocity."""
     knee: float = 5.8
-    """rad of knee bend per m above the height."""
+    """Gain of the stance knee: rad of bend per m of the pelvis above its commanded height."""
     velocity_filter: float = 0.321
     """Weight of each tick's leg odometry in the estimated velocity."""
     least_speed: float = 0.05
-    """m/s (a third of it per rad/s of turning) of commanded velocity that makes it step."""
+    """It steps above this commanded speed plus a third of the commanded yaw rate (rad/s), m/s."""
     tipping: tuple[float, float] = (0.35, 0.6)
     """rad of tilt off the reference, plus 0.15 s times the tilting rate, that makes a standing
     robot step, and a stepping one step on."""
@@ -101,12 +103,12 @@ class Gait:
     """State of the clock and of the legs' odometry; leading axis B."""
 
     phase: Array  # (B,) rad
-    amount: Array  # (B,) 0 standing .. 1 walking
-    left: Array  # (B,) s until it may stand
+    blend: Array  # (B,) 0 standing .. 1 walking
+    stepping_time_left: Array  # (B,) s until it may stand
     shifting: Array  # (B,) s until the first foot may leave the floor
     feet: Array  # (B, 2, 3) m, from the pelvis in the heading frame, at the last tick
     velocity: Array  # (B, 2) m/s, estimated, in the heading frame
-    turned: Array  # (B,) rad off the commanded turn since it began to step, bounded
+    heading_error: Array  # (B,) rad off the commanded turn since it began to step, bounded
 
 
 def start(joint_position: Array, gravity: Array) -> Gait:
@@ -114,12 +116,12 @@ def start(joint_position: Array, gravity: Array) -> Gait:
     n = len(joint_position)
     return Gait(
         phase=np.zeros(n),
-        amount=np.zeros(n),
-        left=np.zeros(n),
+        blend=np.zeros(n),
+        stepping_time_left=np.zeros(n),
         shifting=np.zeros(n),
         feet=_feet(joint_position, gravity),
         velocity=np.zeros((n, 2)),
-        turned=np.zeros(n),
+        heading_error=np.zeros(n),
     )
 
 
@@ -127,25 +129,25 @@ def _feet(joint_position: Array, gravity: Array) -> Array:
     return rotate(heading_rotation(gravity)[:, None], foot_positions(joint_position))
 
 
-def sense(m: Gait, state: Array, config: GaitConfig) -> None:
+def sense(gait: Gait, state: Array, config: GaitConfig) -> None:
     """Odometry: velocity by the feet that carry, each as much as it does; in place."""
     feet = _feet(
         state[:, STATE_SLICES["joint_position"]], state[:, STATE_SLICES["projected_gravity"]]
     )
-    load = _load(m, config)
-    moved = (m.feet - feet)[..., :2] / DT
+    load = _load(gait, config)
+    moved = (gait.feet - feet)[..., :2] / DT
     velocity = moved[:, 0] * load[:, :1] + moved[:, 1] * load[:, 1:]
-    m.velocity = m.velocity + config.velocity_filter * (velocity - m.velocity)
-    m.feet = feet
+    gait.velocity = gait.velocity + config.velocity_filter * (velocity - gait.velocity)
+    gait.feet = feet
 
 
 def advance(
-    m: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
+    gait: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
 ) -> NDArray[np.bool_]:
     """One tick of the clock, in place, after `sense`.
 
     Args:
-        m: memory.
+        gait: state.
         row: standing pose of the height.
         height: (B,) m of the pelvis.
         tilt: (B, 2) rad, roll and pitch off the reference.
@@ -158,31 +160,32 @@ def advance(
     command = state[:, STATE_SLICES["command_velocity"]]
     rate = state[:, STATE_SLICES["angular_velocity"]]
     speed = np.sqrt((command[:, :2] ** 2).sum(axis=1)) + np.abs(command[:, 2]) / 3
-    standing = m.amount <= 0
+    standing = gait.blend <= 0
     tipping = np.where(standing, *config.tipping)
     leaning = np.sqrt(((tilt + 0.15 * rate[:, :2]) ** 2).sum(axis=1)) > tipping
-    leaning |= standing & _leaves_support(m, row, height, config)
+    leaning |= standing & _leaves_support(gait, row, height, config)
     wanted = (speed > config.least_speed) | leaning
-    before = m.phase
-    _tick(m, standing, leaning, command, rate, config)
-    m.left = np.where(wanted, config.linger, np.maximum(m.left - DT, 0.0))
-    landed = (before // np.pi) != (m.phase // np.pi)
-    stops = (m.left <= 0) & ((m.amount < 1.0) | landed)
+    before = gait.phase
+    _tick(gait, standing, leaning, command, rate, config)
+    time_left = np.maximum(gait.stepping_time_left - DT, 0.0)
+    gait.stepping_time_left = np.where(wanted, config.linger, time_left)
+    landed = (before // np.pi) != (gait.phase // np.pi)
+    stops = (gait.stepping_time_left <= 0) & ((gait.blend < 1.0) | landed)
     change = np.where(stops, -DT / config.fade, DT / config.rise)
-    m.amount = _bounded(m.amount + change, 0.0, 1.0)
-    m.amount = np.where(standing & ~wanted, 0.0, m.amount)
-    off = _bounded(m.turned + DT * (rate[:, 2] - command[:, 2]), -0.5, 0.5)
-    m.turned = np.where(m.amount > 0, off, 0.0)
-    stands: NDArray[np.bool_] = ~standing & (m.amount <= 0)
+    gait.blend = _bounded(gait.blend + change, 0.0, 1.0)
+    gait.blend = np.where(standing & ~wanted, 0.0, gait.blend)
+    off = _bounded(gait.heading_error + DT * (rate[:, 2] - command[:, 2]), -0.5, 0.5)
+    gait.heading_error = np.where(gait.blend > 0, off, 0.0)
+    stands: NDArray[np.bool_] = ~standing & (gait.blend <= 0)
     return stands
 
 
 def _leaves_support(
-    m: Gait, row: StanceRow, height: Array, config: GaitConfig
+    gait: Gait, row: StanceRow, height: Array, config: GaitConfig
 ) -> NDArray[np.bool_]:
     """(B,) whether x + v / omega is outside the ellipse about the feet that stand."""
-    place = -0.5 * (m.feet[:, 0, :2] + m.feet[:, 1, :2]) - row.pelvis[:, :2]
-    extrapolated = place + m.velocity / _omega(height)[:, None]
+    place = -0.5 * (gait.feet[:, 0, :2] + gait.feet[:, 1, :2]) - row.pelvis[:, :2]
+    extrapolated = place + gait.velocity / _omega(height)[:, None]
     out: NDArray[np.bool_] = ((extrapolated / config.support) ** 2).sum(axis=1) > 1.0
     return out
 
@@ -193,7 +196,7 @@ def _omega(height: Array) -> Array:
 
 
 def _tick(
-    m: Gait,
+    gait: Gait,
     standing: NDArray[np.bool_],
     leaning: NDArray[np.bool_],
     command: Array,
@@ -210,13 +213,13 @@ def _tick(
     turn = np.pi * DT / config.step_time
     shift = np.where(leaning, 0.0, config.shift)
     begins = (first - np.pi * shift / config.step_time) % (2 * np.pi)
-    m.phase = np.where(standing, begins, (m.phase + turn) % (2 * np.pi))
-    m.shifting = np.where(standing, shift, np.maximum(m.shifting - DT, 0.0))
+    gait.phase = np.where(standing, begins, (gait.phase + turn) % (2 * np.pi))
+    gait.shifting = np.where(standing, shift, np.maximum(gait.shifting - DT, 0.0))
 
 
-def _load(m: Gait, config: GaitConfig) -> Array:
+def _load(gait: Gait, config: GaitConfig) -> Array:
     """(B, 2) share of the weight on the left and on the right foot."""
-    swing = _bounded(np.sin(m.phase) / config.soften, -1.0, 1.0) * (m.amount > 0)
+    swing = _bounded(np.sin(gait.phase) / config.soften, -1.0, 1.0) * (gait.blend > 0)
     out = np.empty((len(swing), 2))
     out[:, 0], out[:, 1] = 0.5 - 0.5 * swing, 0.5 + 0.5 * swing
     return out
@@ -227,25 +230,27 @@ def _bounded(x: Array, low: float, high: float) -> Array:
     return np.asarray(np.minimum(np.maximum(x, low), high))
 
 
-def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: GaitConfig) -> Array:
+def foothold(
+    gait: Gait, row: StanceRow, height: Array, command: Array, config: GaitConfig
+) -> Array:
     """(B, 2) m, where the swinging foot should land, from the pelvis in the heading frame.
 
     Args:
-        m: the clock, the feet and the velocity.
+        gait: the clock, the feet and the velocity.
         row: the standing pose.
         height: (B,) m of the pelvis above the floor.
         command: (B, 3) velocity, m/s and rad/s.
         config: gains.
     """
-    side, stance = _swinging(m)
-    foot = m.feet[np.arange(len(side)), stance, :2]
+    side, stance = _swinging(gait)
+    foot = gait.feet[np.arange(len(side)), stance, :2]
     offset = row.pelvis[:, 0]  # of the balanced pelvis from the ankles
     omega = _omega(height)
     time = config.step_time
-    rest = (1.0 - m.phase % np.pi / np.pi) * time
+    rest = (1.0 - gait.phase % np.pi / np.pi) * time
     cosh, sinh = np.cosh(omega * rest), np.sinh(omega * rest)
     grown = np.exp(omega * time)
-    velocity = m.velocity * cosh[:, None]
+    velocity = gait.velocity * cosh[:, None]
     velocity[:, 0] += (-foot[:, 0] - offset) * omega * sinh
     velocity[:, 1] += -foot[:, 1] * omega * sinh
     caught = velocity / omega[:, None] * config.capture
@@ -259,19 +264,19 @@ def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: Gai
     return out
 
 
-def _swinging(m: Gait) -> tuple[Array, NDArray[np.intp]]:
+def _swinging(gait: Gait) -> tuple[Array, NDArray[np.intp]]:
     """(B,) the side (1 left, -1 right) that swings, and (B,) the index of the foot that stands."""
-    left = np.sin(m.phase) >= 0
+    left = np.sin(gait.phase) >= 0
     return np.where(left, 1.0, -1.0), np.where(left, 1, 0)
 
 
 def leg_motion(
-    m: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
+    gait: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
 ) -> Array:
     """(B, 15) rad that full gait adds to the targets of standing at that height.
 
     Args:
-        m: memory, advanced.
+        gait: state, advanced.
         row: standing pose and torques of the height.
         height: (B,) m of the pelvis, as it should be by now.
         tilt: (B, 2) rad, roll and pitch off the reference.
@@ -283,14 +288,14 @@ def leg_motion(
     rate = state[:, STATE_SLICES["angular_velocity"]]
     measured = state[:, STATE_SLICES["joint_position"]][:, :_LEGS].reshape(n, 2, 6)
     pose, torque = (x[:, :_LEGS].reshape(n, 2, 6).copy() for x in (row.joints, row.torque))
-    side, _ = _swinging(m)
+    side, _ = _swinging(gait)
     swings = (side[:, None] == _SIDE)[..., None]  # (B, 2, 1)
-    load = _load(m, config)
+    load = _load(gait, config)
     torque *= (1.0 + (2.0 * load - 1.0) * config.carry)[..., None]
     torque[..., _HIP_ROLL] += _SIDE * config.hip_moment * np.maximum(2.0 * load - 1.0, 0.0)
-    swing = pose + _swing(m, pose, row, height, command, tilt, config)
+    swing = pose + _swing(gait, pose, row, height, command, tilt, config)
     swing += config.swing_gain * _OVERDRIVEN * (swing - measured)
-    stance = pose + _stance(m, pose, row, height, command, tilt, rate, load, config)
+    stance = pose + _stance(gait, pose, row, height, command, tilt, rate, load, config)
     out = np.zeros((n, NU))
     out[:, :_LEGS] = np.where(swings, swing, stance).reshape(n, _LEGS) - row.joints[:, :_LEGS]
     out[:, :_LEGS] += (torque.reshape(n, _LEGS) - row.torque[:, :_LEGS]) / _KP[:_LEGS]
@@ -303,7 +308,7 @@ def _leg_length(pose: Array) -> Array:
 
 
 def _swing(
-    m: Gait,
+    gait: Gait,
     pose: Array,
     row: StanceRow,
     height: Array,
@@ -313,11 +318,11 @@ def _swing(
 ) -> Array:
     """(B, 2, 6) what either leg adds to the pose if it swings: shorter, and to its foothold."""
     length = _leg_length(pose)
-    leaves = (m.shifting <= 0)[:, None]
-    progress = m.phase[:, None] % np.pi / np.pi
+    leaves = (gait.shifting <= 0)[:, None]
+    progress = gait.phase[:, None] % np.pi / np.pi
     shorter = length - config.lift * np.sin(np.pi * progress) * leaves
     bend = 2 * np.arccos(_bounded(shorter / (2 * _THIGH), 0.0, 1.0)) - pose[..., _KNEE]
-    goal = foothold(m, row, height, command, config)
+    goal = foothold(gait, row, height, command, config)
     done = progress**2 * (3.0 - 2.0 * progress) * leaves
     along = done * (goal[:, :1] + row.pelvis[:, :1]) / length
     across = done * (goal[:, 1:] - _SIDE * HALF_STANCE_WIDTH) / length
@@ -331,7 +336,7 @@ def _swing(
 
 
 def _stance(
-    m: Gait,
+    gait: Gait,
     pose: Array,
     row: StanceRow,
     height: Array,
@@ -343,13 +348,13 @@ def _stance(
 ) -> Array:
     """(B, 2, 6) what either leg adds to the pose if it stands: balance about where it is."""
     length = _leg_length(pose)
-    ahead = 2 * DT * m.velocity  # targets act about two ticks after what was measured
-    along = (m.feet[..., 0] + row.pelvis[:, :1] - ahead[:, :1]) / length
-    across = (m.feet[..., 1] - _SIDE * HALF_STANCE_WIDTH - ahead[:, 1:]) / length
-    over = -m.feet[..., 0] - row.pelvis[:, :1]  # m, the pelvis ahead of either foot
-    fast = m.velocity - command[:, :2]
+    ahead = 2 * DT * gait.velocity  # targets act about two ticks after what was measured
+    along = (gait.feet[..., 0] + row.pelvis[:, :1] - ahead[:, :1]) / length
+    across = (gait.feet[..., 1] - _SIDE * HALF_STANCE_WIDTH - ahead[:, 1:]) / length
+    over = -gait.feet[..., 0] - row.pelvis[:, :1]  # m, the pelvis ahead of either foot
+    fast = gait.velocity - command[:, :2]
     roll, pitch = tilt.T
-    bend = config.knee * (-m.feet[..., 2] - (height[:, None] - ANKLE_HEIGHT))
+    bend = config.knee * (-gait.feet[..., 2] - (height[:, None] - ANKLE_HEIGHT))
     hip, tip, ankle, edge = (
         config.hip_pitch,
         config.hip_roll,
@@ -364,6 +369,6 @@ def _stance(
     out[..., _HIP_ROLL] = across + (tip[0] * roll + tip[1] * rate[:, 0])[:, None]
     out[..., _ANKLE_ROLL] = -across + load * edge[2] * fast[:, 1:]
     out[..., _ANKLE_ROLL] += (edge[0] * roll + edge[1] * rate[:, 0])[:, None]
-    turning = rate[:, 2] - command[:, 2]
-    out[..., _HIP_YAW] = (config.hip_yaw[0] * m.turned + config.hip_yaw[1] * turning)[:, None]
+    yaw, turning = gait.heading_error, rate[:, 2] - command[:, 2]
+    out[..., _HIP_YAW] = (config.hip_yaw[0] * yaw + config.hip_yaw[1] * turning)[:, None]
     return out

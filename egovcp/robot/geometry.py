@@ -59,7 +59,8 @@ def quaternion(rotation: Array) -> Array:
 
 
 def rotation_vector(before: Array, after: Array) -> Array:
-    """Rotation from one attitude (..., 3, 3) to another: (..., 3) rad, in the first one's frame."""
+    """Rotation of less than half a turn from one attitude (..., 3, 3) to another: (..., 3) rad, in
+    the first one's frame."""
     turn = np.swapaxes(before, -1, -2) @ after
     skew = 0.5 * np.stack(
         [

@@ -52,7 +52,8 @@ def _cross_matrices(axis: Array) -> Array:
     return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
 
 
-REST_ROTATION: Final[Array] = np.array(_TABLE["rest"])  # (J, 3, 3) R0, R0 K and R0 K^2
+#: R0, R0 K and R0 K^2, (J, 3, 3) each.
+REST_ROTATION: Final[Array] = np.array(_TABLE["rest"])
 SIN_ROTATION: Final[Array] = REST_ROTATION @ _cross_matrices(JOINT_AXIS)
 COS_ROTATION: Final[Array] = SIN_ROTATION @ _cross_matrices(JOINT_AXIS)
 

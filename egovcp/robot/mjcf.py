@@ -27,7 +27,7 @@ def robot_spec(feet: FootModel = "stock") -> mujoco.MjSpec:
 
     Args:
         feet: ``stock``: seven capsules per foot as shipped; ``points``: four spheres per
-            foot, about 2.5 times as fast to step.
+            foot, about twice as fast to step.
 
     Actuator ``i`` drives ``spec.JOINT_NAMES[i]`` and has its name. Robot geoms have contype 0 and
     conaffinity 1: they collide with scene geoms of contype 1, not with each other. The foot geoms

@@ -118,15 +118,15 @@ class Walk:
         row = self._table.at(m.balance.height)
         stands = gait.advance(m.gait, row, m.balance.height, tilt, s, self.config.gait)
         self._restart_standing(stands)
-        amount = m.gait.amount[:, None]
-        arm_targets = self._reach(s, amount[:, 0] > 0)
+        blend = m.gait.blend[:, None]
+        arm_targets = self._reach(s, blend[:, 0] > 0)
         body = balance(m.balance, s, row, m.arms, self.config.balance)
         motion = gait.leg_motion(m.gait, row, m.balance.height, tilt, s, self.config.gait)
-        body += amount * (motion - m.balance.correction)
+        body += blend * (motion - m.balance.correction)
         self._nominal = np.asarray(np.concatenate([body, arm_targets], axis=1))
-        phase, turned = m.gait.phase[:, None], m.gait.turned[:, None]
-        clock = [amount * np.sin(phase), amount * np.cos(phase), amount]
-        seen = [s, *clock, m.gait.velocity, turned, m.action]
+        phase, yaw = m.gait.phase[:, None], m.gait.heading_error[:, None]
+        clock = [blend * np.sin(phase), blend * np.cos(phase), blend]
+        seen = [s, *clock, m.gait.velocity, yaw, m.action]
         return np.concatenate(seen, axis=1, dtype=np.float32)
 
     def targets(self, action: NDArray[np.floating]) -> Array:
@@ -193,7 +193,7 @@ class WalkingController:
     @property
     def stepping(self) -> NDArray[np.bool_]:
         """(B,) robots whose targets contain any of the gait."""
-        return self._walk.gait.amount > 0
+        return self._walk.gait.blend > 0
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
         """See `LowLevelController`."""

@@ -92,10 +92,13 @@ def require_class(robot_class: type | None, tasks: Iterable[str]) -> None:
     for task in tasks:
         found = getattr(find_task(task), "robot_class", None)
         if found is not robot_class:
-            names = [getattr(kind, "__qualname__", "the G1") for kind in (found, robot_class)]
+            own, expected = (
+                f"robot class {kind.__qualname__}" if kind else "the G1"
+                for kind in (found, robot_class)
+            )
             raise UsageError(
-                f"the robot_class of task {task} is {names[0]}, expected {names[1]}: simulate, "
-                "train and evaluate each robot by itself"
+                f"task {task} is of {own}, expected one of {expected}: simulate, train and "
+                "evaluate each robot by itself"
             )
 
 

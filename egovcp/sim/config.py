@@ -17,7 +17,13 @@ from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
 from egovcp.sim.tasks.options import MAX_REWARD, EpisodeConfig, Range
 from egovcp.sim.tasks.registry import find_task, task_entries
-from egovcp.spec import ACTION_RATE_COST, POSE_COST
+from egovcp.spec import (
+    ACTION_RATE_COST,
+    CAMERA_PITCH_RANGE,
+    CAMERA_POSITION,
+    CAMERA_VERTICAL_FOV,
+    POSE_COST,
+)
 
 _ROBOT_BYTES: Final = 900_000  # MuJoCo state of one robot and its scene, measured
 
@@ -26,14 +32,12 @@ _ROBOT_BYTES: Final = 900_000  # MuJoCo state of one robot and its scene, measur
 class CameraConfig:
     """Depth camera on the head, and the noise of its images."""
 
-    position: tuple[float, float, float] = bounded((0.058, 0.0, 0.42), least=-1, most=1)
+    position: tuple[float, float, float] = bounded(CAMERA_POSITION, least=-1, most=1)
     """Mount in the torso frame, m."""
-    pitch_range: Range = bounded(
-        (math.radians(-15.0), math.radians(-10.0)), least=-math.pi / 2, most=math.pi / 2
-    )
+    pitch_range: Range = bounded(CAMERA_PITCH_RANGE, least=-math.pi / 2, most=math.pi / 2)
     """Tilt below the torso's horizontal, rad, drawn per episode. The default looks up by 10 to 15
     degrees, which keeps thrown balls in the image (docs/data.md)."""
-    vertical_fov: float = bounded(math.radians(58.0), least=0.1, most=3)
+    vertical_fov: float = bounded(CAMERA_VERTICAL_FOV, least=0.1, most=3)
     """Vertical field of view, rad; pixels are square."""
     noise_per_z2: Range = bounded((0.001, 0.004), least=0, most=1)
     """Standard deviation of depth over depth squared, 1/m (stereo noise grows with z^2)."""
@@ -61,7 +65,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class DelayConfig:
-    """Delays, drawn per episode, in whole controller ticks of 20 ms."""
+    """Delays, drawn per episode and rounded to controller ticks of 20 ms."""
 
     action_ticks: tuple[int, int] = bounded((0, 2), least=0, most=50)
     """Controller ticks from an action to its effect."""
@@ -71,7 +75,8 @@ class DelayConfig:
 
 @dataclass(frozen=True)
 class RandomisationConfig:
-    """Ranges of the physical parameters, drawn per episode; (1, 1) switches one off."""
+    """Ranges of the physical parameters, drawn per episode. A range of one value, such as (1, 1)
+    for a factor or (0, 0) for the payload, fixes it."""
 
     friction: Range = bounded((0.6, 1.0), least=0.01, most=5)
     """Sliding friction of the feet; the simulation diverges without any."""

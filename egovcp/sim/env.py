@@ -79,8 +79,8 @@ class VectorEnv(BaseVectorEnv):
         render_depth: if false, depth images are zero, which is faster; all else is the same.
 
     Raises:
-        UsageError: unknown task, wrong shapes, actions that are not numbers, or a task that needs
-            a controller that walks, and another one.
+        UsageError: unknown task, wrong shapes, actions that are not numbers, or a task in which
+            the robot walks, with a controller that does not.
     """
 
     def __init__(

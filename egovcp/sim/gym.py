@@ -18,11 +18,11 @@ GymObservation = dict[str, NDArray[Any]]
 
 
 class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
-    """One robot in one task, 25 Hz.
+    """One robot in one task.
 
-    Shapes are those of the robot of the task, here the G1's. Observation: ``depth`` (H, W) uint16
-    mm, 0 invalid, and ``state`` (S,) float32. Action:
-    (7,) in [-1, 1]. ``info`` holds ``success``, ``sent_action`` and ``reward_terms``.
+    Shapes and rate are those of the robot of the task. Observation: ``depth`` (H, W) uint16 mm,
+    0 invalid, and ``state`` (S,) float32. Action: (A,) in [-1, 1]. ``info`` holds ``success``,
+    ``sent_action`` and ``reward_terms``.
     ``reset(seed=n)`` starts episode 0 of seed n, ``reset()`` the next episode of the seed.
     """
 
@@ -57,7 +57,7 @@ class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[GymObservation, float, bool, bool, dict[str, Any]]:
-        """One planner tick of 40 ms."""
+        """One planner tick; 40 ms of the G1."""
         result = self._env.step(np.asarray(action)[None])
         info = {
             "success": bool(result.success[0]),

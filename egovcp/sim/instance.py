@@ -41,6 +41,7 @@ Array = NDArray[np.float64]
 
 _NO_IMAGE: Final = np.zeros((DEPTH_ROWS, DEPTH_COLS), dtype=np.uint16)
 _SETTLE_TICKS: Final = 100  # controller ticks, 2 s
+_LEAST_HEIGHT: Final = 0.6  # m, pelvis of a robot that stands
 _NOISELESS: Final = SensorConfig(0.0, 0.0, 0.0, 0.0)
 #: Ranges in `RandomisationConfig`; their order is part of what is sampled.
 _PHYSICS: Final = ("friction", "payload", "mass_scale", "stiffness_scale", "damping_scale")
@@ -105,11 +106,11 @@ def settle(config: EnvConfig, controller: LowLevelController) -> StandingPose:
         for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
             robot.step()
         sensors.measure(robot.data, state[0])
-    if robot.diverged or robot.pelvis_height < 0.6:
+    if robot.diverged or robot.pelvis_height < _LEAST_HEIGHT:
         raise EnvironmentFailure(
             f"the controller {controller.id} does not stand: pelvis at "
-            f"{robot.pelvis_height:.2f} m after 2 s, expected {ACTION_BOX.neutral[-1]} m; "
-            "it was made for another robot model"
+            f"{robot.pelvis_height:.2f} m after 2 s, expected at least {_LEAST_HEIGHT} m; use it "
+            "with the robot model that it was trained on"
         )
     q = robot.data.qpos.copy()
     return StandingPose(np.array([0.0, 0.0, q[2]]), q[3:7], q[scene.index.joint_qpos])
@@ -192,8 +193,8 @@ class EnvInstance(BaseInstance):
         """What datasets record of the scenario."""
         return {
             "event_tick": self.task.event_tick,
-            "action_delay": self.action_delay,
-            "image_age": self.image_age,
+            "action_delay_ticks": self.action_delay,
+            "image_age_ticks": self.image_age,
             "camera_pitch": self.camera_pitch,
             "physics": self.physics,
             "scene": self.task.parameters,

@@ -110,7 +110,9 @@ class LiveRobot:
             used, and whether it walks.
 
     Raises:
-        UsageError: the configuration makes no sense.
+        UsageError: the controller is unknown.
+        ArtifactError: its file cannot be used.
+        EnvironmentFailure: the controller does not keep the robot standing.
     """
 
     def __init__(self, config: EnvConfig) -> None:

@@ -112,8 +112,8 @@ def build_scene(tasks: tuple[type[Task], ...], feet: FootModel) -> Scene:
                 raise ValueError("each of its bodies needs a name that no other body has")
             objects[task.name] = set(names) - known
             known.update(names)
-            model = spec.compile() if task is tasks[-1] else None
-            if model is not None and model.nu != len(JOINT_NAMES):
+            model = spec.compile()  # after each task, so that the error names the right one
+            if model.nu != len(JOINT_NAMES):
                 raise ValueError("it adds actuators, which only the robot has")
         except Exception as error:
             problem = " ".join(str(error).split()) or type(error).__name__

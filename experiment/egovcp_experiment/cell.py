@@ -49,7 +49,7 @@ class CellOutput:
 
 
 @dataclass(frozen=True)
-class CellFigure:
+class CellMetric:
     """Reference to a value in another cell's metrics."""
 
     cell: str
@@ -60,13 +60,13 @@ class CellFigure:
 
 @dataclass(frozen=True)
 class ExternalPath:
-    """Reference to a file or folder that no cell writes, or to a Hub repository."""
+    """Reference to a file or folder that no cell writes."""
 
     path: str
     """As the user wrote it."""
 
 
-type Reference = CellOutput | CellFigure | ExternalPath
+type Reference = CellOutput | CellMetric | ExternalPath
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class CellCommand:
     """The command as typed in a shell, for reports."""
     output: str
     """Flag for the output folder."""
-    figures: Callable[[Path], dict[str, Any]]
+    metrics: Callable[[Path], dict[str, Any]]
     """Reads the metrics to store from the output folder."""
     digest: Callable[[Path], str]
     """SHA-256 of the outputs that other cells read."""
@@ -116,7 +116,7 @@ class Cell:
 
 def resolve(value: Any, reference_value: Callable[[Reference], Any]) -> Any:
     """The value with each reference replaced by ``reference_value(reference)``."""
-    if isinstance(value, CellOutput | CellFigure | ExternalPath):
+    if isinstance(value, CellOutput | CellMetric | ExternalPath):
         return reference_value(value)
     if isinstance(value, Mapping):
         return {name: resolve(part, reference_value) for name, part in value.items()}
@@ -141,7 +141,7 @@ def checkpoint_artifact(step: int) -> str:
 
 
 def external_digest(path: str) -> str:
-    """SHA-256 of an artifact, dataset or file; of a Hub repository only of its name."""
+    """SHA-256 of an artifact, dataset or file; of a dataset of other tools only of its path."""
     folder = user_path(path)
     if (folder / MANIFEST).is_file():
         return _artifact_digest(folder)
@@ -156,7 +156,7 @@ def _artifact_digest(folder: Path) -> str:
     return str(read_manifest(folder)[SEAL])
 
 
-def _collect_figures(folder: Path) -> dict[str, Any]:
+def _collect_metrics(folder: Path) -> dict[str, Any]:
     info = read_json(folder / "meta" / "info.json")
     collection = read_json(folder / COLLECTION_PATH)
     return {
@@ -166,12 +166,12 @@ def _collect_figures(folder: Path) -> dict[str, Any]:
     }
 
 
-def _train_figures(folder: Path) -> dict[str, Any]:
+def _train_metrics(folder: Path) -> dict[str, Any]:
     manifest = read_manifest(folder / ARTIFACT)
     return {"step": manifest["step"], "tasks": manifest["heldout_tasks"]}
 
 
-def _ppo_figures(folder: Path) -> dict[str, Any]:
+def _ppo_metrics(folder: Path) -> dict[str, Any]:
     policy = ReactiveNetwork.load(folder / "checkpoints" / "last" / PPO_POLICY)
     return {name: policy.provenance[name] for name in ("steps", "episodes")}
 
@@ -192,7 +192,7 @@ def _digest_of_checkpoints(folder: Path, digest: Callable[[Path], str]) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _eval_figures(folder: Path) -> dict[str, Any]:
+def _eval_metrics(folder: Path) -> dict[str, Any]:
     """Task -> controller -> metrics; ``played`` has a column per episode quantity."""
     run = read_json(folder / "eval_run.json")["episodes"]
     return {
@@ -224,7 +224,7 @@ COLLECT: Final = CellCommand(
     module="egovcp_collect.collect",
     prog="egovcp-collect",
     output="dataset.root",
-    figures=_collect_figures,
+    metrics=_collect_metrics,
     digest=lambda folder: sha256(folder / HASHES_PATH),
     minutes=lambda flags: 0.0012 * float(flags["episodes"]),
     options="egovcp_collect.config:CollectConfig",
@@ -234,7 +234,7 @@ TRAIN: Final = CellCommand(
     module="egovcp_train.train",
     prog="egovcp-train",
     output="output_dir",
-    figures=_train_figures,
+    metrics=_train_metrics,
     digest=_train_digest,
     minutes=lambda flags: 0.0095 * float(flags["steps"]),
     options="egovcp_train.config:TrainConfig",
@@ -244,7 +244,7 @@ TRAIN_PPO: Final = CellCommand(
     module="egovcp_train.ppo.train",
     prog="egovcp-train-ppo",
     output="output_dir",
-    figures=_ppo_figures,
+    metrics=_ppo_metrics,
     digest=_ppo_digest,
     minutes=lambda flags: 3e-5 * float(flags["steps"]),
     options="egovcp_train.ppo.train:PpoTrainConfig",
@@ -255,7 +255,7 @@ PLAY: Final = CellCommand(
     module="egovcp_deploy.evaluate",
     prog="egovcp-eval",
     output="output_dir",
-    figures=_eval_figures,
+    metrics=_eval_metrics,
     digest=lambda folder: sha256(folder / "eval_run.json"),
     minutes=_play_minutes,
     options="egovcp_deploy.evaluate:EvalConfig",
@@ -270,7 +270,7 @@ def study(name: str, exclusive: bool = False) -> CellCommand:
         module=module,
         prog=f"python -m {module}",
         output="output_dir",
-        figures=lambda folder: dict(read_json(folder / RESULT)),
+        metrics=lambda folder: dict(read_json(folder / RESULT)),
         digest=lambda folder: sha256(folder / RESULT),
         minutes=lambda flags: _STUDY_MINUTES.get(name, 0.03) * float(flags.get("episodes", 100)),
         exclusive=exclusive,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import Final
@@ -16,16 +17,24 @@ from egovcp.cli import parse_config, preset_defaults
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError
 from egovcp.files import user_path
-from egovcp.hub import is_local_path
-from egovcp.packages import require_packages
+from egovcp.packages import is_installed, require_packages
 from egovcp.subcommands import CommandGroup, Subcommand
 from egovcp.terminal import echo
 from egovcp_experiment.cell import COLLECT, PLAY, TRAIN, TRAIN_PPO, CellCommand
 from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.report import publish
+from egovcp_experiment.report import ExperimentReport, publish
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
+
+#: Option of `ExperimentConfig.command_flags` -> the command that gets its flags.
+_COMMANDS: Final[Mapping[str, CellCommand]] = {
+    "scenes": COLLECT,
+    "data.flags": COLLECT,
+    "train.flags": TRAIN,
+    "play.flags": PLAY,
+    "ppo.flags": TRAIN_PPO,
+}
 
 
 def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
@@ -40,10 +49,11 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
-    require_given(config)
+    require_flags(config)
+    given = with_local_policies(config)
     prog, name = argv[:2]
     experiment = EXPERIMENTS[name]
-    cells = experiment.cells(config)
+    cells = experiment.cells(given)
     store = CellStore(user_path(config.output_dir))
     with store.locked():
         scheduler = CellScheduler(cells, store, config.jobs, echo)
@@ -51,30 +61,41 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
         commands = dict.fromkeys(c.command for c in cells if c.name not in records)
         for command in commands:
             require_packages("egovcp-train", command.prog, *command.packages)
-        require_flags(config, commands)
         echo(f"{prog} {name}: {len(cells)} cells, {len(records)} complete; {scheduler.outlook}")
-        try:
-            scheduler.run()
-        finally:
+
+        def write_report() -> ExperimentReport:
             complete = {c.name: records[c.name] for c in cells if c.name in records}
             missing = [cell.name for cell in cells if cell.name not in records]
-            report = experiment.report(config, complete)
+            report = experiment.report(given, complete)
             encoded = draccus.encode(config)
             publish(store.folder, name, report, complete, missing, encoded, shlex.join(argv))
+            return report
+
+        written = f"report: {store.folder / name}.html, .md, .json"
+        try:
+            scheduler.run()
+        except BaseException:
+            try:
+                write_report()
+                echo(written)
+            except Exception as error:  # noqa: BLE001 - the cause of the end is raised
+                echo(f"warning: the report could not be written: {error!r}", error=True)
+            raise
+        report = write_report()
     for line in (*report.lead, *report.findings):
         echo(f"- {line}")
-    echo(f"report: {store.folder / name}.html, .md, .json")
+    echo(written)
 
 
-def require_given(config: ExperimentConfig) -> None:
-    """Refuse unusable `data.roots` and `train.policies` before any cell runs.
-
-    Policies on the Hub are checked by their cells.
+def with_local_policies(config: ExperimentConfig) -> ExperimentConfig:
+    """Refuse unusable `data.roots` and `train.policies` before any cell runs; policies become
+    folders, those on the Hub of a download, so that all cells use the same commit.
 
     Raises:
         UsageError: a folder is not named, or a dataset is of another task or robot.
         DataError: a dataset is missing or damaged.
         ArtifactError: a policy is missing or damaged.
+        EnvironmentFailure: the Hub cannot be reached.
     """
     for task, root in config.data.roots.items():
         with _naming(f"--data.roots: {task}"):
@@ -87,26 +108,23 @@ def require_given(config: ExperimentConfig) -> None:
                     f"{root} holds {', '.join(tasks)} of robot {reader.robot.robot_type}; expected "
                     f"{task} of the G1"
                 )
+    policies = {}
     for task, path in config.train.policies.items():
         with _naming(f"--train.policies: {task}"):
-            if is_local_path(path):
-                load_artifact(path)
+            policies[task] = str(load_artifact(path).path)
+    return replace(config, train=replace(config.train, policies=policies))
 
 
-def require_flags(config: ExperimentConfig, commands: Collection[CellCommand]) -> None:
-    """Refuse unusable flags for the commands of cells before any cell runs.
+def require_flags(config: ExperimentConfig) -> None:
+    """Refuse unusable flags for the commands of cells before any cell runs; those of a command
+    that is not installed are not checked.
 
     Raises:
         UsageError: a flag is unknown, or its value is invalid.
     """
-    for option, command, flags in (
-        ("scenes", COLLECT, config.scenes),
-        ("data.flags", COLLECT, config.data.flags),
-        ("train.flags", TRAIN, config.train.flags),
-        ("play.flags", PLAY, config.play.flags),
-        ("ppo.flags", TRAIN_PPO, config.ppo.flags),
-    ):
-        if flags and command in commands:
+    for option, flags in config.command_flags.items():
+        command = _COMMANDS[option]
+        if flags and all(map(is_installed, command.packages)):
             module, _, name = command.options.partition(":")
             argv = [f"--{command.output}=FOLDER", *flags]
             with _naming(f"--{option}"):

@@ -2,17 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.errors import UsageError, suggest
+from egovcp.flags import OTHER_NAMES
 
 #: The paper's tasks.
 TASKS: Final = ("ball", "wall", "arch")
 #: So that `table1` can compare the objectives of the planner with one model.
 _REWARD_HEAD: Final = "--policy.loss.reward=1"
+#: So that all trainings draw the same windows: auto depends on the free memory, and stream draws
+#: others.
+_IN_MEMORY: Final = "--loading.mode=ram"
+#: Option of `ExperimentConfig.command_flags` -> flags or groups of flags that cells set -> the
+#: option to give instead, if any.
+_SET_BY_CELLS: Final[Mapping[str, Mapping[str, str]]] = {
+    "scenes": {"task": "tasks"},
+    "data.flags": {
+        "task": "tasks",
+        "episodes": "data.episodes",
+        "seed": "data.seed",
+        "dataset": "output_dir",
+        "resume": "",
+    },
+    "train.flags": {
+        "preset": "train.preset",
+        "steps": "train.steps",
+        "max_minutes": "train.steps",
+        "seed": "train.seeds",
+        "dataset": "data.roots",
+        "datasets": "data.roots",
+        "output_dir": "output_dir",
+        "resume": "",
+    },
+    "play.flags": {
+        "task": "tasks",
+        "episodes": "play.episodes",
+        "seed": "play.seed",
+        "controllers": "",
+        "policy": "train.policies",
+        "ppo": "",
+        "output_dir": "output_dir",
+    },
+    "ppo.flags": {
+        "task": "tasks",
+        "steps": "ppo.steps",
+        "max_minutes": "ppo.steps",
+        "save_freq": "ppo.policies",
+        "robots": "ppo.robots",
+        "ppo.num_steps_per_env": "ppo.ticks",
+        "seed": "train.seeds",
+        "output_dir": "output_dir",
+        "resume": "",
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -61,7 +107,7 @@ class TrainingConfig:
     flags: tuple[str, ...] = (
         "--eval_freq=0",
         "--tensorboard=false",
-        "--loading.mode=ram",  # auto depends on the free memory, and stream draws other windows
+        _IN_MEMORY,
         _REWARD_HEAD,
     )
     """Further flags of egovcp-train."""
@@ -78,7 +124,7 @@ class PlayConfig:
     branches: int = bounded(6, least=2, most=10_000)
     """Random-walk rollouts from each plan step; their mean return is what Q is compared with
     (experiment `variance`)."""
-    budget_ms: float = bounded(12.0, above=0)  # 64 candidates on one core without AVX-512
+    budget_ms: float = bounded(12.0, above=0)  # fits 64 candidates on one core without AVX-512
     """Time budget per plan in the experiment `planners`, ms."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-eval; studies in simulation use those of the planner."""
@@ -112,16 +158,6 @@ class PpoBaselineConfig:
             return ()
         each = self.updates * self.robots * self.ticks
         return tuple(each * (k + 1) for k in range(self.policies))
-
-    def check(self) -> None:
-        """Raise `UsageError` for flags that would change when policies are saved."""
-        own = ("steps", "robots", "ppo.num_steps_per_env", "save_freq", "max_minutes")
-        for flag in self.flags:
-            if flag.removeprefix("--").split("=", 1)[0] in own:
-                raise UsageError(
-                    f"--ppo.flags holds {flag}, which changes when policies are saved; set "
-                    "--ppo.steps, --ppo.policies, --ppo.robots and --ppo.ticks instead"
-                )
 
 
 @dataclass(frozen=True)
@@ -182,7 +218,19 @@ class ExperimentConfig:
         for flag in self.scenes:
             if not flag.startswith("--env."):
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
-        self.ppo.check()
+        for option, flags in self.command_flags.items():
+            _refuse_flags_of_cells(option, flags)
+
+    @property
+    def command_flags(self) -> dict[str, tuple[str, ...]]:
+        """Option -> its flags for the commands of cells."""
+        return {
+            "scenes": self.scenes,
+            "data.flags": self.data.flags,
+            "train.flags": self.train.flags,
+            "play.flags": self.play.flags,
+            "ppo.flags": self.ppo.flags,
+        }
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
         """The variants that `only` names, or the first `most`.
@@ -195,6 +243,17 @@ class ExperimentConfig:
                 raise UsageError(f"unknown variant --only={name}{suggest(name, variants)}")
         names = self.only or tuple(variants)[: self.most or None]
         return {name: variants[name] for name in variants if name in names}
+
+
+def _refuse_flags_of_cells(option: str, flags: Sequence[str]) -> None:
+    """Raise `UsageError` for flags that cells set."""
+    for flag in flags:
+        name = flag.removeprefix("--").split("=", 1)[0]
+        name = OTHER_NAMES.get(name, name)
+        for own, instead in _SET_BY_CELLS[option].items():
+            if f"{name}.".startswith(f"{own}.") or own.startswith(f"{name}."):
+                hint = f"give --{instead}" if instead else "leave it out"
+                raise UsageError(f"--{option} holds {flag}, which the experiment sets; {hint}")
 
 
 def smoke() -> ExperimentConfig:
@@ -242,8 +301,8 @@ def smoke() -> ExperimentConfig:
 
 
 def small() -> ExperimentConfig:
-    """Hours on two cores: at most 500 000 random steps per task, 3000 gradient steps per model, 100
-    paired episodes."""
+    """Hours on two cores: 200 000 to 400 000 random steps per task, 3000 gradient steps per model,
+    100 paired episodes."""
     return ExperimentConfig()
 
 
@@ -257,7 +316,7 @@ def paper() -> ExperimentConfig:
         train=TrainingConfig(
             steps=100_000,
             seeds=(0, 1, 2),
-            flags=("--eval_freq=0", _REWARD_HEAD),
+            flags=("--eval_freq=0", _IN_MEMORY, _REWARD_HEAD),
         ),
         ppo=PpoBaselineConfig(steps=5_000_000, policies=10),
         play=PlayConfig(episodes=300, branches=12, budget_ms=40.0),

@@ -1,4 +1,4 @@
-"""Drawing of paired differences, one panel per task."""
+"""Plot of paired differences, one panel per task."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egovcp_experiment.report import Plot, draw
 
 
 class Difference(NamedTuple):
-    """A paired difference in units of the drawing."""
+    """A paired difference in units of the plot."""
 
     value: float
     interval: Interval

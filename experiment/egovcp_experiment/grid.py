@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from egovcp.artifact import policy_folder, shipped_policies
 from egovcp.data.schema import INFO_PATH
 from egovcp.files import user_path
 from egovcp_experiment.cell import (
@@ -115,8 +114,7 @@ class Grid:
         """Artifact of a model trained on a task, or on `ALL`."""
         path = self.given_policy(task)
         if path and not model.flags and not model.step:
-            shipped = path in shipped_policies()
-            return ExternalPath(str(policy_folder(path)) if shipped else path)
+            return ExternalPath(path)
         artifact = checkpoint_artifact(model.step) if model.step else ARTIFACT
         return CellOutput(self.train(task, seed, model).name, artifact)
 

@@ -15,10 +15,10 @@ from egovcp.files import write_json, write_text
 from egovcp_experiment.cell import Record
 
 _SMOKE: Final = "Scale `smoke`: every command ran once. **The metrics mean nothing.**"
-#: Explains the tables and drawings of every page.
+#: Explains the tables and plots of experiments that play scenarios.
 INTERVALS: Final = (
-    "In brackets and bands: 95 % intervals over scenarios. The rows of a table play the same "
-    "scenarios; differences are paired. How trainings differ by their seeds is not included."
+    "In brackets and bands: 95 % intervals over scenarios, which do not include how trainings "
+    "differ by their seeds. The rows of a table play the same scenarios; differences are paired."
 )
 _DIGITS: Final = 12  # of a shortened hash
 _STYLE: Final = """
@@ -44,7 +44,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """An SVG drawing."""
+    """A plot in SVG."""
 
     name: str
     """Part of the file name."""
@@ -64,14 +64,16 @@ class ExperimentReport:
     """One line."""
     lead: list[str] = field(default_factory=list)
     """The sentences that matter, about three; they begin the page."""
-    figure: Plot | None = None
-    """The drawing that matters, next on the page."""
+    plot: Plot | None = None
+    """The plot that matters, next on the page."""
+    note: str = INTERVALS
+    """How to read tables and plots, next on the page."""
     findings: list[str] = field(default_factory=list)
     """Further conclusions that are derived from the metrics."""
     sections: list[Part] = field(default_factory=list)
-    """Paragraphs, tables and drawings."""
-    figures: dict[str, Any] = field(default_factory=dict)
-    """The same for programs."""
+    """Paragraphs, tables and plots."""
+    metrics: dict[str, Any] = field(default_factory=dict)
+    """The report's numbers as JSON."""
 
 
 def number(value: float | None, form: str = ".3g") -> str:
@@ -110,7 +112,7 @@ def draw(
     paint: Callable[[Any], None],
     size: tuple[float, float] = (8.0, 3.2),
 ) -> Plot:
-    """Draw with Matplotlib; equal names and drawings give equal files.
+    """Draw with Matplotlib; equal names and plots give equal files.
 
     ``paint`` gets an empty `matplotlib.figure.Figure` of this width and height, inches.
     """
@@ -137,7 +139,7 @@ def publish(
     config: Mapping[str, Any],
     command: str,
 ) -> None:
-    """Write NAME.json, NAME.md with its drawings, and NAME.html.
+    """Write NAME.json, NAME.md with its plots, and NAME.html.
 
     Args:
         records: results of the cells that the report is made from.
@@ -155,7 +157,7 @@ def publish(
         "title": report.title,
         "lead": report.lead,
         "findings": report.findings,
-        "figures": report.figures,
+        "metrics": report.metrics,
         "cells": dict(records),
         "missing": list(missing),
         "config": config,
@@ -163,7 +165,7 @@ def publish(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / f"{name}.json", content)
-    for part in (report.figure, *report.sections):
+    for part in (report.plot, *report.sections):
         if isinstance(part, Plot):
             head = '<?xml version="1.0" encoding="utf-8"?>\n'
             write_text(folder / f"{name}-{part.name}.svg", f"{head}{part.svg}\n")
@@ -213,10 +215,10 @@ def _markdown(report: ExperimentReport, origin: Sequence[Part], stem: str) -> st
         return f"**{part.title}**\n\n{rows}" if part.title else rows
 
     lead = " ".join(report.lead)
-    figure = [convert(report.figure)] if report.figure else []
+    plot = [convert(report.plot)] if report.plot else []
     findings = "\n".join(f"- {line}" for line in report.findings)
     sections = [convert(part) for part in (*report.sections, *origin)]
-    blocks = [f"# {report.title}", lead, *figure, INTERVALS, findings, *sections]
+    blocks = [f"# {report.title}", lead, *plot, report.note, findings, *sections]
     return "\n\n".join(block for block in blocks if block) + "\n"
 
 
@@ -236,12 +238,13 @@ def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
 
     title = escape(report.title)
     lead = "".join(f"<p>{_inline(line)}</p>" for line in report.lead)
-    figure = convert(report.figure) if report.figure else ""
+    plot = convert(report.plot) if report.plot else ""
+    note = f"<p>{_inline(report.note)}</p>" if report.note else ""
     findings = "".join(f"<li>{_inline(line)}</li>" for line in report.findings)
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f"<title>{title}</title><style>{_STYLE}</style></head><body>\n<h1>{title}</h1>\n"
-        f'<div class="lead">{lead}</div>\n{figure}\n<p>{INTERVALS}</p>\n<ul>{findings}</ul>\n'
+        f'<div class="lead">{lead}</div>\n{plot}\n{note}\n<ul>{findings}</ul>\n'
         + "\n".join(map(convert, report.sections))
         + "\n<details><summary>How each number was made</summary>\n"
         + "\n".join(map(convert, origin))

@@ -19,7 +19,7 @@ def eval_scores(
     records: Records, cells: Iterable[str], task: str, controller: str = "planner"
 ) -> EvalScores | None:
     """Scores of a controller on a task from cells, one per seed; None if all are missing."""
-    rows = [records[name]["figures"][task][controller] for name in cells if name in records]
+    rows = [records[name]["metrics"][task][controller] for name in cells if name in records]
     if not rows:
         return None
 
@@ -50,7 +50,7 @@ def controller_scores(
     return {name: scores for name, scores in found.items() if scores is not None}
 
 
-def figures_of(scores: Mapping[Any, EvalScores]) -> dict[str, Any]:
+def metrics_of(scores: Mapping[Any, EvalScores]) -> dict[str, Any]:
     """Name -> metrics."""
     return {str(name): each.figures() for name, each in scores.items()}
 
@@ -77,29 +77,6 @@ def comparison(title: str, scores: Mapping[str, EvalScores], reference: str) -> 
             row += [""] * 2 if each is base else each.gain(base).columns()
         rows.append(row)
     return Table(title, head, rows)
-
-
-def comparison_plot(
-    name: str, title: str, scores: Mapping[str, EvalScores], reference: str
-) -> Plot:
-    """Success and reward of each with their intervals."""
-
-    def paint(figure: Any) -> None:
-        rows = range(len(scores))
-        for axes, (label, curve) in zip(figure.subplots(1, 2), _QUANTITIES.items(), strict=True):
-            for row, each in zip(rows, scores.values(), strict=True):
-                middle, low, high = curve(each)
-                axes.plot([low, high], [row, row], color="C0", linewidth=1.5)
-                axes.plot([middle], [row], "o", color="C0", markersize=4)
-            axes.set_yticks(list(rows), list(scores))
-            axes.invert_yaxis()
-            axes.set_xlabel(label)
-            if reference in scores:
-                middle = curve(scores[reference])[0]
-                axes.axvline(middle, color="0.7", linewidth=0.8, zorder=0)
-
-    height = 0.9 + 0.25 * len(scores)
-    return draw(name, f"{title}, with 95 % intervals", paint, (8.0, height))
 
 
 def _success_percent(scores: EvalScores) -> tuple[float, float, float]:
@@ -186,8 +163,10 @@ OVER_SEEDS: Final = "several seeds: mean and half of the range"
 
 
 def heldout(records: Records, cells: Iterable[str], task: str) -> dict[str, list[float]]:
-    """Column -> its values in the trainings, one per seed; empty without results."""
-    runs = [records[cell]["figures"]["tasks"][task] for cell in cells if cell in records]
+    """Column -> its values in the trainings, one per seed; empty without results, or if no episode
+    of the task is held out."""
+    found = [records[cell]["metrics"]["tasks"] for cell in cells if cell in records]
+    runs = [tasks[task] for tasks in found if task in tasks]
     values = {name: [column(run) for run in runs] for name, column in HELDOUT.items() if runs}
     return {name: [v for v in column if v is not None] for name, column in values.items()}
 

@@ -1,6 +1,6 @@
 """The output folder of experiments, with one result per complete cell.
 
-cells/NAME.json   result: settings, figures, minutes, command, hashes
+cells/NAME.json   result: settings, metrics, minutes, command, hashes
 work/NAME/        output of the command
 logs/NAME.log     standard output and error of the command
 """
@@ -25,7 +25,7 @@ from egovcp.files import UnsafeFileError, read_json, write_json
 from egovcp.values import differences
 from egovcp_experiment.cell import (
     Cell,
-    CellFigure,
+    CellMetric,
     CellOutput,
     ExternalPath,
     Record,
@@ -42,7 +42,7 @@ _LIMIT_BYTES: Final = 1 << 28  # of a result, which may hold images and maps
 _ENTRIES: Final[Mapping[str, Any]] = {
     "settings": dict[str, Any],
     "sha256": str,
-    "figures": dict[str, Any],
+    "metrics": dict[str, Any],
     "minutes": float,
 }
 
@@ -54,6 +54,8 @@ class CellStore:
         self.folder = folder
         self.records: dict[str, Record] = {}
         """The known results by name of the cell."""
+        self._prepared: dict[str, dict[str, Any]] = {}
+        """Settings at the start of a cell's command, by name of the cell."""
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -87,7 +89,7 @@ class CellStore:
 
         Raises:
             UsageError: the stored result has other settings.
-        DataError: it is damaged.
+            DataError: it is damaged.
         """
         path = self._path(cell)
         if not path.exists():
@@ -113,8 +115,8 @@ class CellStore:
                     return {"cell": name, "path": path, "sha256": self.records[name]["sha256"]}
                 case ExternalPath(path):
                     return {"sha256": external_digest(path)}
-                case CellFigure():
-                    return self._figure(reference)
+                case CellMetric():
+                    return self._metric(reference)
 
         settings = {
             "module": cell.command.module,
@@ -126,7 +128,8 @@ class CellStore:
         return through_json
 
     def prepare(self, cell: Cell) -> list[str]:
-        """Arguments of a cell's command; an interrupted run is resumed, or else removed."""
+        """Arguments of a cell's command; an interrupted run is resumed, or else removed. Its result
+        will have the settings of now."""
 
         def location(reference: Reference) -> Any:
             match reference:
@@ -134,9 +137,10 @@ class CellStore:
                     return str(self._work(name) / path)
                 case ExternalPath(path):
                     return path
-                case CellFigure():
-                    return self._figure(reference)
+                case CellMetric():
+                    return self._metric(reference)
 
+        self._prepared[cell.name] = self.settings(cell)
         work = self._work(cell.name)
         resume_flags = cell.command.resume_flags(work)
         if resume_flags is None:
@@ -148,7 +152,7 @@ class CellStore:
 
     def save(self, cell: Cell, argv: Sequence[str], facts: Mapping[str, Any]) -> None:
         """Write the result of a cell whose command has succeeded, with ``facts`` of the run."""
-        settings = self.settings(cell)
+        settings = self._prepared[cell.name]
         work = self._work(cell.name)
         text = json.dumps(settings, sort_keys=True)
         record = {
@@ -158,7 +162,7 @@ class CellStore:
             "sha256": cell.command.digest(work),
             "command": f"{cell.command.prog} {shlex.join(argv)}",
             **facts,
-            "figures": cell.command.figures(work),
+            "metrics": cell.command.metrics(work),
         }
         write_json(self._path(cell), record)
         self.records[cell.name] = record
@@ -169,8 +173,8 @@ class CellStore:
     def _work(self, name: str) -> Path:
         return self.folder / "work" / name
 
-    def _figure(self, reference: CellFigure) -> Any:
-        return reduce(getitem, reference.keys, self.records[reference.cell]["figures"])
+    def _metric(self, reference: CellMetric) -> Any:
+        return reduce(getitem, reference.keys, self.records[reference.cell]["metrics"])
 
 
 def _read_record(path: Path) -> Record:

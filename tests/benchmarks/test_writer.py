@@ -13,4 +13,4 @@ def test_all_writers_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("sys.argv", ["writer.py", *flags.split()])
     writer.main()
     metrics = json.loads(out.read_text())
-    assert all(metrics[f"{name}_frames_per_s"] > 0 for name in ("lerobot", "writer", "service"))
+    assert all(metrics[f"{name}_frames_per_s"] > 0 for name in ("lerobot", "writer", "collect"))

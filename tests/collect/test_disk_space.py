@@ -11,6 +11,7 @@ import pytest
 
 from egovcp.data import open_dataset
 from egovcp.data.committer import work_folder
+from egovcp.data.episode import frame_bytes
 from egovcp.data.metadata import verify_hashes
 from egovcp.data.staging import encode, to_bytes
 from egovcp.errors import EnvironmentFailure
@@ -31,14 +32,14 @@ def _free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
 
 
 def test_frame_bytes_match_a_staged_episode() -> None:
-    raw = 100 * collect.frame_bytes(G1)
+    raw = 100 * frame_bytes(G1)
     assert raw < to_bytes(encode(random_episode(0, 100))).size < 1.05 * raw
 
 
 @pytest.mark.parametrize("shard", [1, 3, 100])
 def test_needed_bytes_lie_between_compressed_and_uncompressed_size(shard: int) -> None:
     env = EnvConfig()
-    raw = collect.frame_bytes(G1) * sum(env.episode(s.task).ticks for s in _SCENARIOS)
+    raw = frame_bytes(G1) * sum(env.episode(s.task).ticks for s in _SCENARIOS)
     needed = collect.min_bytes(_SCENARIOS, env, shard)
     assert collect.MIN_COMPRESSED_SHARE * raw < needed <= raw
     assert needed < collect.min_bytes([*_SCENARIOS, _SCENARIOS[0]], env, shard)

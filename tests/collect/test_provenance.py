@@ -10,9 +10,10 @@ import draccus
 import pytest
 
 from egovcp.data import Provenance
+from egovcp.data.provenance import ScenarioKeys
 from egovcp.errors import UsageError
 from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
-from egovcp_collect.provenance import require_compatible
+from egovcp_collect.provenance import make_provenance, require_compatible
 
 
 def provenance(task: str = "ball") -> Provenance:
@@ -29,6 +30,14 @@ def test_a_missing_option_counts_as_its_default() -> None:
     other["env"]["ball"]["shape"] = "box"
     with pytest.raises(UsageError, match=r"--env\.ball\.shape was sphere, is box"):
         require_compatible(replace(now, config=other), replace(now, config=older))
+
+
+def test_what_is_collected_is_recorded_as_simulated() -> None:
+    recorded = make_provenance(CollectConfig(task="ball"), "egovcp-collect")
+    assert recorded.origin == "simulated"
+    older = replace(recorded, origin="")
+    facts = {"episode": 3}  # a scenario of an earlier version is the same one
+    assert ScenarioKeys(recorded).key("ball", facts) == ScenarioKeys(older).key("ball", facts)
 
 
 def test_versions_of_packages_are_compared_but_not_that_of_python() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.log.mcap_reader import read_recording
-from egovcp.log.picture import AHEAD
+from egovcp.log.rollout_video import AHEAD
 from egovcp_deploy.demo import DemoConfig, main
 
 FILES = {f"rollout.{kind}" for kind in ("gif", "mcap", "mp4", "png", "rrd")}

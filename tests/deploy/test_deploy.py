@@ -60,6 +60,7 @@ def test_rollouts_are_recorded_and_summed_up(
     for i, row in enumerate(report["rollouts"]):
         played = read_recording(out / row["mcap"])
         assert played.complete
+        assert row["rrd"] == f"rollout-{i}.rrd"
         assert played.info.backend == report["backend"]
         assert (played.info.seed, played.info.episode) == (3, i)
         assert "model.safetensors" in played.info.hashes
@@ -231,7 +232,7 @@ def test_the_environment_is_recorded(tmp_path: Path, artifact_dir: Path, short: 
 def test_a_replay_has_task_seed_and_episode_of_its_recording(
     tmp_path: Path, artifact_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenes = ["--env.controller=stance", "--env.wall_episode.ticks=5"]
+    scenes = ["--env.controller=stance", "--env.wall_episode={ticks: 5, event_ticks: [3, 3]}"]
     flags = ["--task=wall", "--controller=hold", "--episodes=2", "--seed=3"]
     assert run(*flags, *scenes, *UNDRAWN, f"--output_dir={tmp_path / 'played'}") == 0
     (tmp_path / "played" / "rollout-0.mcap").unlink()
@@ -244,7 +245,9 @@ def test_a_replay_has_task_seed_and_episode_of_its_recording(
     info = read_recording(out / "rollout-0.mcap").info
     for found in ((info.task, info.seed, info.episode), (row["task"], row["seed"], row["episode"])):
         assert found == ("wall", 3, 1)
-    assert (report["task"], report["seed"], row["mcap"]) == ("wall", 3, "rollout-0.mcap")
+    assert row["mcap"] == "rollout-0.mcap"
+    assert "task" not in report, "another recording may be of another task"
+    assert "rrd" not in row, "a file that was not written"
 
 
 def test_a_simulated_robot_needs_no_camera_driver(
@@ -267,7 +270,7 @@ def test_the_task_of_a_real_robot_is_recorded_if_it_is_given(
     monkeypatch.setattr(deploy, "drive", lambda config, artifact: driven.append(config))
     given = ["--robot.type=unitree_g1", f"--policy.path={artifact_dir}", *flags]
     assert run(*given, f"--output_dir={tmp_path / 'out'}") == 0
-    assert recording.run_info(driven[0], "walk", None, "").task == task
+    assert recording.make_run_info(driven[0], "walk", None, "").task == task
 
 
 def test_the_camera_of_a_real_robot_is_the_configured_one() -> None:
@@ -277,7 +280,7 @@ def test_the_camera_of_a_real_robot_is_the_configured_one() -> None:
         ),
         env=EnvConfig(camera=CameraConfig(position=(0.1, 0.0, 0.5), pitch_range=(0.1, 0.3))),
     )
-    camera = recording.run_info(config, "walk", None, "").camera
+    camera = recording.make_run_info(config, "walk", None, "").camera
     assert (camera.position, camera.pitch, camera.vertical_fov) == ((0.1, 0.0, 0.5), 0.2, 0.8)
 
 

@@ -171,7 +171,7 @@ def test_a_sequence_reports_the_success_of_each_part(
         f"--constant.path={tmp_path / 'constant.json'}",
         "--episodes=2",
         "--env.sequence.parts=[ball,wall]",
-        "--env.wall_episode.ticks=6",
+        "--env.wall_episode={ticks: 6, event_ticks: [3, 3]}",
         *short,
     ]
     assert run(tmp_path / "out", *flags) == 0, capsys.readouterr().err
@@ -310,13 +310,13 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
 ) -> None:
     monkeypatch.setattr(library, "compiler", lambda: None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    library.library.cache_clear()
+    library.load_kernel.cache_clear()
     out = tmp_path / "out"
     flags = [f"--policy.path={artifact_dir}", f"--output_dir={out}", "--planner.backend=int8"]
     try:
         assert {"evaluate": main, "deploy": deploy}[command]([*flags, *short]) == 5
     finally:
-        library.library.cache_clear()
+        library.load_kernel.cache_clear()
     message = capsys.readouterr().err
     assert "there is no C compiler" in message
     assert "plan with --planner.backend=float32" in message

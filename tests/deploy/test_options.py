@@ -55,10 +55,12 @@ def test_planner_options_change_only_what_they_name() -> None:
     assert PlannerOptions(action_parameterization="target").apply(own) == replace(
         own, action_parameterization="target"
     )
-    with pytest.raises(UsageError):
-        PlannerOptions(samples=2).apply(own)  # fewer than the elites
+    with pytest.raises(UsageError, match=r"planner\.elites=4 exceeds planner\.samples=2"):
+        PlannerOptions(samples=2).apply(own)
     with pytest.raises(UsageError, match="min_std=-1: expected at least 0"):
         PlannerOptions(min_std=-1).apply(own)
+    with pytest.raises(UsageError, match=r"--planner\.min_std=11.*: expected .* at most 10"):
+        parse_config(EvalConfig, ["--planner.min_std=11"], "egovcp-eval")
 
 
 def test_scenario_seeds_of_collection_evaluation_and_search_are_disjoint() -> None:

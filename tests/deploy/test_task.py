@@ -90,8 +90,9 @@ def test_a_reference_that_cannot_be_imported_is_one_line(
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["new", "Bag"], "'Bag' cannot be the name of a task"),
-        (["new", "camera"], "'camera' cannot be the name of a task"),
+        (["new", "9bag"], "'9bag' cannot be the name of a task: .*a letter first"),
+        (["new", "camera"], "'camera' cannot be the name of a task: it is an option of --env"),
+        (["new", "bag_episode"], "'bag_episode' cannot .*: names of options end in _episode"),
         (["new", "ball"], "egovcp .* has a task 'ball'"),
         (["check", "bal"], "did you mean 'ball'"),
         (["play", "ball", "--controller=best"], "expected hold or random or oracle"),

@@ -191,6 +191,12 @@ class _RisesAgain(_Altered):
         return dataclasses.replace(step, terminated=nobody, truncated=nobody)
 
 
+class _PaysLate(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        ones = np.ones(self.num_envs)
+        return dataclasses.replace(step, reward=ones, reward_terms={"pay": ones})
+
+
 class _Wanders(_Altered):
     def alter(self, step: ToyStep) -> ToyStep:
         depth = step.observation.depth + np.uint16(self.calls)
@@ -216,10 +222,11 @@ class _NotANumber(_Altered):
     ("broken", "message"),
     [
         (_LateCommand, "tick 3: the command in the state is not the last one sent"),
-        (_Jumps, "rate limit"),
+        (_Jumps, "above the rate limit of 0.32; limit it in step"),
         (_WrongSum, "tick 3: reward is not the sum of its terms"),
         (_BothEnds, "tick 3: a row is terminated and truncated at once"),
         (_RisesAgain, "an episode continues after its end"),
+        (_PaysLate, r"rewards \[1\.\] in rows \[\d\] after the end of their episodes; expected 0"),
         (_Wanders, "depth differs between two runs with the same actions"),
         (_OtherShape, r"tick 3: depth is uint16 \(2, 48, 64, 1\)"),
         (_NotANumber, "tick 3: state is not finite"),

@@ -104,6 +104,16 @@ def test_other_arguments_are_part_of_the_key() -> None:
     assert recorder.captures == 2
 
 
+def test_autocast_is_part_of_the_key() -> None:
+    recorder = RecomputingCapture()
+    recorded = GraphedFunction(torch.matmul, recorder)
+    x = torch.rand(4, 4)
+    for bf16 in (True, False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            assert recorded(x, x).dtype == (torch.bfloat16 if bf16 else torch.float32)
+    assert recorder.captures == 2
+
+
 def test_uncopied_results_are_overwritten_by_the_next_call() -> None:
     recorded = GraphedFunction(_function, RecomputingCapture(), copies=False)
     first = recorded(*_arguments(4, 0))

@@ -161,6 +161,9 @@ def test_log_messages_are_escaped(run: Run) -> None:
         (["check", "--env.camera", "{a: [0, 1]}", "my:Task"], "my:Task"),
         (["check", "my:Task"], "my:Task"),
         (["check", "--task", "my:Task"], "my:Task"),
+        (["check", "--env.task=my:Task"], "my:Task"),
+        (["check", "--json", "-", "my:Task"], "my:Task"),
+        (["check", "--debug", "my:Task"], "my:Task"),
     ],
 )
 def test_only_the_argument_of_a_task_names_one(

@@ -17,18 +17,18 @@ ROWS, COLS = spec.DEPTH_ROWS, spec.DEPTH_COLS
 
 
 def _flat(metres: list[float]) -> np.ndarray:
-    """One flat picture for each robot."""
+    """One flat depth image for each robot."""
     depth = np.array(metres, dtype=np.float64)[:, None, None] * 1e3
     return np.broadcast_to(depth, (len(metres), ROWS, COLS)).astype(np.uint16)
 
 
-def _seen(stack: FrameStack, metres: list[float], fresh: list[bool]) -> list[list[float]]:
-    pictures = stack.push(_flat(metres), np.array(fresh))
-    return [[round(float(x.mean()), 3) for x in robot] for robot in pictures]
+def _seen(stack: FrameStack, metres: list[float], is_first: list[bool]) -> list[list[float]]:
+    images = stack.push(_flat(metres), np.array(is_first))
+    return [[round(float(x.mean()), 3) for x in robot] for robot in images]
 
 
 def test_frames_are_newest_first_and_repeat_after_a_reset() -> None:
-    stack = FrameStack(2, ReactiveConfig(frames=3, depth_max_m=5.0))
+    stack = FrameStack(2, ReactiveConfig(frames=3))
     assert _seen(stack, [1.0, 2.0], [True, True]) == [[0.8] * 3, [0.6] * 3]
     assert _seen(stack, [2.0, 3.0], [False, False]) == [[0.6, 0.8, 0.8], [0.4, 0.6, 0.6]]
     assert _seen(stack, [3.0, 4.0], [False, True]) == [[0.4, 0.6, 0.8], [0.2] * 3]
@@ -58,9 +58,9 @@ def test_save_and_load_round_trip(tmp_path: Path) -> None:
     network = toy_reactive("walk-1")
     network.save(tmp_path / "ppo.safetensors")
     loaded = ReactiveNetwork.load(tmp_path / "ppo.safetensors")
-    pictures = torch.rand(3, 2, ROWS, COLS)
+    images = torch.rand(3, 2, ROWS, COLS)
     state = torch.randn(3, spec.STATE_DIM)
-    assert torch.equal(network(pictures, state), loaded(pictures, state))
+    assert torch.equal(network(images, state), loaded(images, state))
     assert (loaded.config, loaded.controller_id) == (network.config, "walk-1")
     assert loaded.provenance == {"steps": 0}
     loaded.require_controller("walk-1")
@@ -83,14 +83,28 @@ def test_damaged_files_are_refused(
     path = tmp_path / "ppo.safetensors"
     toy_reactive("c").save(path)
     tensors = {k: v for k, v in (load_file(path) | change).items() if v is not None}
-    content = {
-        "config": {"frames": 2, "channels": [2, 4, 4], "hidden": [16]},
-        "controller_id": "c",
-        "provenance": {},
-    }
-    save_file(tensors, path, {"schema": SCHEMA, "content": json.dumps(content)})
+    _write(path, tensors)
     with pytest.raises(ArtifactError, match=message):
         ReactiveNetwork.load(path)
+
+
+@pytest.mark.parametrize(("depth_max_m", "is_read"), [(spec.DEPTH_MAX_M, True), (3.0, False)])
+def test_files_of_earlier_versions_are_read(
+    tmp_path: Path, depth_max_m: float, is_read: bool
+) -> None:
+    path, network = tmp_path / "ppo.safetensors", toy_reactive("c")
+    _write(path, dict(network.tensors), depth_max_m=depth_max_m)
+    if is_read:
+        assert ReactiveNetwork.load(path).config == network.config
+    else:
+        with pytest.raises(ArtifactError, match="depth_max_m"):
+            ReactiveNetwork.load(path)
+
+
+def _write(path: Path, tensors: dict[str, torch.Tensor], **config: float) -> None:
+    sizes = {"frames": 2, "channels": [2, 4, 4], "hidden": [16]}
+    content = {"config": sizes | config, "controller_id": "c", "provenance": {}}
+    save_file(tensors, path, {"schema": SCHEMA, "content": json.dumps(content)})
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

@@ -64,7 +64,9 @@ def test_a_description_survives_json() -> None:
         ({"depth": (512, 512)}, "at most 30000 pixels"),
         ({"depth_max_m": 80.0}, "depth_max_m is 80"),
         ({"planner_hz": 0}, "planner_hz is 0"),
-        ({"state_names": ("x", "x")}, "all different"),
+        ({"state_names": ("x", "y", "x")}, "state_names has 'x' twice"),
+        ({"state_names": ("x", "")}, r"state_names\[1\] is empty"),
+        ({"state_names": ("x",)}, "state_names are 1 names, expected 2 to 1024"),
         ({"action_names": ("a", "b")}, "for each of 2 actions"),
         ({"mirror": Mirror((1, 2, 0, 3, 4), (1,) * 5, (0, 1, 2), (1, 1, 1))}, "no reflection"),
         ({"mirror": Mirror((0, 1), (1, 1), (0, 1, 2), (1, 1, 1))}, "no reflection"),
@@ -142,7 +144,7 @@ def test_a_changed_robot_does_not_fit_the_weights(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("optimiser", ["cem", "mppi"])
 def test_the_kernel_plans_for_other_sizes(optimiser: str) -> None:
-    if library.library_if_possible() is None:
+    if library.load_kernel_if_possible() is None:
         pytest.skip("no C compiler")
     sizes = dataclasses.replace(PRESETS["debug"], hidden=64, latent=16, units=64)
     model = toy_model(sizes, robot=ARM)

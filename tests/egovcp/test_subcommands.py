@@ -78,6 +78,7 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
         (["a", "b", "c", "d"], CopyConfig("a", "b", ["c", "d"])),
         (["--mode", "soft", "a", "--fast", "b"], CopyConfig("a", "b", fast=True, mode="soft")),
         (["--target=b", "a"], CopyConfig("a", "b")),
+        (["--target", "-", "a"], CopyConfig("a", "-")),
     ],
 )
 def test_arguments_without_a_flag_stand_for_options(argv: list[str], config: CopyConfig) -> None:

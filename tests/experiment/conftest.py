@@ -57,7 +57,7 @@ def cell(tmp_path: Path, diary: Path, monkeypatch: pytest.MonkeyPatch) -> MakeCe
         module="quick_command",
         prog="quick",
         output="output_dir",
-        figures=lambda folder: dict(read_json(folder / "result.json")),
+        metrics=lambda folder: dict(read_json(folder / "result.json")),
         digest=lambda folder: sha256(folder / "result.json"),
         minutes=lambda flags: 60.0 * float(flags.get("hours", 0.0)),
         resume_flags=lambda folder: {"resume": True} if (folder / "checkpoint").exists() else None,

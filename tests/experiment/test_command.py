@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from egovcp import packages
+from egovcp.artifact import save_artifact
 from egovcp.data import DatasetWriter, Provenance
-from egovcp.testing import random_episode
-from egovcp_experiment.command import main
+from egovcp.errors import EnvironmentFailure
+from egovcp.manifest import SEAL, read_manifest
+from egovcp.plan import PlannerConfig
+from egovcp.testing import random_episode, toy_model
+from egovcp_experiment.command import main, with_local_policies
+from egovcp_experiment.config import SCALES, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.scheduler import CellScheduler
+from egovcp_experiment.store import CellStore
 
 
 def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,6 +60,8 @@ def test_help_shows_the_defaults_of_the_scale(
         (["planners", "--output_dir=x", "--train.flags=[--batch_size=0]"], "--train.flags: "),
         (["planners", "--output_dir=x", "--play.flags=[--num_envs=x]"], "--play.flags: "),
         (["ppo", "--output_dir=x", "--ppo.flags=[--ppo.entropy_coef=x]"], "--ppo.flags: "),
+        (["sample-efficiency", "--output_dir=x", "--train.flags=[--save_freq=0]"], "--save_freq=0"),
+        (["table1", "--output_dir=x", "--train.flags=[--seed=3]"], "give --train.seeds"),
         (["planners", "--output_dir=x", "--only=[cme]"], "did you mean 'cem'"),
         (["planners", "--output_dir=x", "--jobs=0"], "--jobs=0"),
         (["planners", "--scale=small", "--config_path=a.yaml"], "both set options"),
@@ -123,6 +133,46 @@ def test_a_dataset_of_another_task_is_refused_before_any_cell_runs(
     assert not (tmp_path / "out" / "logs").exists()
 
 
+def test_a_policy_on_the_hub_is_that_of_one_download(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit = tmp_path / "models" / "commit"
+    save_artifact(commit, toy_model(), PlannerConfig(), {"controller_id": "walk-1"})
+    monkeypatch.setattr("egovcp.artifact.snapshot", lambda *args, **options: commit)
+    config = replace(
+        SCALES["smoke"](), train=TrainingConfig(seeds=(0,), policies={"all": "me/policy"})
+    )
+    given = with_local_policies(config)
+    cells = {cell.name: cell for cell in EXPERIMENTS["generalise"].cells(given)}
+    cell = cells["play-ball-default-s0"]
+    assert f"--policy.path={commit}" in (store := CellStore(tmp_path / "out")).prepare(cell)
+    seal = read_manifest(commit)[SEAL]
+    assert store.settings(cell)["flags"]["policy.path"] == {"sha256": seal}
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_failed_cells_are_named_whether_or_not_there_is_a_report(
+    broken: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*args: object) -> None:
+        raise EnvironmentFailure("cell a failed")
+
+    def break_down(*args: object) -> None:
+        raise KeyError("metrics")
+
+    monkeypatch.setattr(CellScheduler, "run", fail)
+    if broken:
+        monkeypatch.setattr("egovcp_experiment.command.publish", break_down)
+    assert main(["planners", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]) == 5
+    out, err = capsys.readouterr()
+    assert err.endswith("cell a failed\n")
+    assert ("the report could not be written: KeyError('metrics')" in err) == broken
+    assert ("report: " in out) != broken
+
+
 @pytest.mark.slow
 def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Collects, trains and reports through the real commands; again, nothing is left to do."""
@@ -133,7 +183,7 @@ def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFix
     content = json.loads((out / "ablations.json").read_text())
     assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-value_two_hot-s0"]
     assert content["missing"] == []
-    assert content["cells"]["collect-ball-10"]["figures"]["episodes"] == 10
+    assert content["cells"]["collect-ball-10"]["metrics"]["episodes"] == 10
     assert "policy.value_loss=two_hot" in (out / "ablations.md").read_text()
     checkpoints = out / "work" / "ablate-ball-value_two_hot-s0" / "checkpoints"
     model = json.loads((checkpoints / "last" / "pretrained_model" / "config.json").read_text())

@@ -21,7 +21,7 @@ from egovcp_experiment.cell import (
     PLAY,
     TRAIN,
     Cell,
-    CellFigure,
+    CellMetric,
     CellOutput,
     ExternalPath,
     resolve,
@@ -195,9 +195,9 @@ def test_every_command_accepts_the_flags_of_its_cells() -> None:
         parse_config(_config(train), ["--output_dir=x", *argv], "train", "", _option_defaults())
 
 
-def _any(reference: CellOutput | CellFigure | ExternalPath) -> object:
+def _any(reference: CellOutput | CellMetric | ExternalPath) -> object:
     """What a reference may stand for."""
-    if not isinstance(reference, CellFigure):
+    if not isinstance(reference, CellMetric):
         return "folder"
     values: Mapping[str, object] = {"optimiser": "cem"}
     return values.get(reference.keys[-1], 1)
@@ -223,7 +223,7 @@ def test_quantities_of_episodes_are_kept_as_columns(tmp_path: Path) -> None:
     episodes = {"ball": {"hold": old, "planner": new}}
     write_json(tmp_path / "eval_run.json", {"episodes": episodes})
     write_json(tmp_path / "eval.json", {"ball": {"hold": {}, "planner": {}}})
-    found = PLAY.figures(tmp_path)["ball"]
+    found = PLAY.metrics(tmp_path)["ball"]
     assert found["planner"]["played"]["terms"] == {"hit": [-0.5, -0.5], "block": [1.0, 1.0]}
     assert found["planner"]["played"]["episode"] == [0, 1]
     assert "terms" not in found["hold"]["played"]

@@ -21,7 +21,7 @@ RECORD: dict[str, Any] = {
     "hardware_cores": 2,
     "hardware_gpu": "none",
     "commit": "1a2b3c4+",
-    "figures": {},
+    "metrics": {},
 }
 
 
@@ -31,10 +31,10 @@ def _report() -> ExperimentReport:
     return ExperimentReport(
         "Title <1>",
         lead=["Ours is **worse**."],
-        figure=replace(plot, name="main", caption="the figure"),
+        plot=replace(plot, name="main", caption="the plot"),
         findings=["a detail"],
         sections=["text", table, plot],
-        figures={"x": 1.5},
+        metrics={"x": 1.5},
     )
 
 
@@ -48,7 +48,7 @@ def test_three_forms_have_the_same_content(tmp_path: Path) -> None:
     content = json.loads((tmp_path / "test.json").read_text())
     text = (tmp_path / "test.md").read_text()
     page = (tmp_path / "test.html").read_text()
-    assert content["figures"] == {"x": 1.5}
+    assert content["metrics"] == {"x": 1.5}
     assert "| a\\|b | `x<1` |" in text
     assert "<td>a|b</td><td><code>x&lt;1</code></td>" in page
     assert "Title &lt;1&gt;" in page
@@ -69,7 +69,13 @@ def test_the_page_refers_to_nothing_outside(tmp_path: Path) -> None:
     assert "@import" not in page
 
 
-def test_drawings_are_reproducible() -> None:
+def test_a_report_without_scenarios_does_not_explain_their_intervals(tmp_path: Path) -> None:
+    publish(tmp_path, "test", replace(_report(), note=""), {}, (), {"scale": "small"}, "command")
+    for form in ("test.md", "test.html"):
+        assert "95 %" not in (tmp_path / form).read_text()
+
+
+def test_plots_are_reproducible() -> None:
     assert _report().sections[2] == _report().sections[2]
 
 
@@ -80,11 +86,11 @@ def test_smoke_and_missing_cells_come_first(tmp_path: Path) -> None:
     assert "1 of 2 cells" in lead[1]
 
 
-def test_the_sentences_and_the_figure_that_matter_come_before_the_rest(tmp_path: Path) -> None:
+def test_the_sentences_and_the_plot_that_matter_come_before_the_rest(tmp_path: Path) -> None:
     _publish(tmp_path)
     for form in ("test.md", "test.html"):
         text = (tmp_path / form).read_text()
-        parts = ("Ours is", "the figure", "95 % intervals over", "a detail", "name", "egovcp-train")
+        parts = ("Ours is", "the plot", "95 % intervals over", "a detail", "name", "egovcp-train")
         places = [text.index(part) for part in parts]
         assert places == sorted(places)
     assert (tmp_path / "test-main.svg").exists()

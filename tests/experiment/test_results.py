@@ -53,7 +53,7 @@ def test_parts_of_a_sequence_have_rates() -> None:
         parts = {"arch": [True, True], "ball": ball}
         played = {"episode": [0, 1], "steps": [5, 5], "reward": [1.0, 2.0], "success": ball}
         row = {"played": {**played, "parts": parts}, "plan_ms_p50": 3.0}
-        return {"figures": {"sequence": {"planner": row}}}
+        return {"metrics": {"sequence": {"planner": row}}}
 
     records = {"a": record([True, False]), "b": record([False, False])}
     found = eval_scores(records, ["a", "b"], "sequence")
@@ -64,7 +64,7 @@ def test_parts_of_a_sequence_have_rates() -> None:
 
 def test_missing_seeds_are_left_out() -> None:
     played = {"episode": [0, 1], "steps": [5, 5], "reward": [1.0, 2.0], "success": [True, False]}
-    record = {"figures": {"ball": {"planner": {"played": played, "plan_ms_p50": 3.0}}}}
+    record = {"metrics": {"ball": {"planner": {"played": played, "plan_ms_p50": 3.0}}}}
     found = eval_scores({"a": record}, ["a", "b"], "ball")
     assert found is not None
     assert (found.success_rate, found.reward_per_step) == (0.5, 0.3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import signal
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
-from egovcp_experiment.cell import COLLECT, Cell, CellFigure, CellOutput, ExternalPath
+from egovcp_experiment.cell import COLLECT, Cell, CellMetric, CellOutput, ExternalPath
 from egovcp_experiment.local_runner import CellProcess, commit
 from egovcp_experiment.scheduler import CellScheduler
 from egovcp_experiment.store import CellStore
@@ -38,14 +39,14 @@ def run(
 
 
 def chain(cell: MakeCell) -> list[Cell]:
-    """a, then b from a file of a, then c from a figure of b."""
+    """a, then b from a file of a, then c from a metric of b."""
     b = cell("b", add=2, source=CellOutput("a", "result.json"))
-    return [cell("a", add=1), b, cell("c", add=CellFigure("b", ("total",)))]
+    return [cell("a", add=1), b, cell("c", add=CellMetric("b", ("total",)))]
 
 
-def test_cells_read_files_and_figures_of_other_cells(cell: MakeCell, tmp_path: Path) -> None:
+def test_cells_read_files_and_metrics_of_other_cells(cell: MakeCell, tmp_path: Path) -> None:
     records = run(chain(cell), tmp_path / "out").records
-    assert [records[name]["figures"]["total"] for name in "abc"] == [1, 3, 3]
+    assert [records[name]["metrics"]["total"] for name in "abc"] == [1, 3, 3]
     assert records["b"]["settings"]["flags"]["source"]["sha256"] == records["a"]["sha256"]
     assert str(tmp_path / "out" / "work" / "a" / "result.json") in records["b"]["command"]
 
@@ -78,10 +79,22 @@ def test_other_content_of_a_given_file_is_refused(cell: MakeCell, tmp_path: Path
     file = tmp_path / "given.json"
     file.write_text('{"total": 4}')
     cells = [cell("a", source=ExternalPath(str(file)))]
-    assert run(cells, tmp_path / "out").records["a"]["figures"]["total"] == 4
+    assert run(cells, tmp_path / "out").records["a"]["metrics"]["total"] == 4
     run(cells, tmp_path / "out")
     file.write_text('{"total": 5}')
     with pytest.raises(UsageError, match=r"flags\.source\.sha256 was"):
+        run(cells, tmp_path / "out")
+
+
+def test_a_result_is_tied_to_the_files_that_its_cell_has_read(
+    cell: MakeCell, tmp_path: Path, diary: Path
+) -> None:
+    """The diary changes during the run."""
+    diary.touch()
+    cells = [cell("a", read=ExternalPath(str(diary)))]
+    found = run(cells, tmp_path / "out").records["a"]["settings"]["flags"]["read"]
+    assert found == {"sha256": hashlib.sha256().hexdigest()}
+    with pytest.raises(UsageError, match=r"flags\.read\.sha256 was"):
         run(cells, tmp_path / "out")
 
 
@@ -124,7 +137,7 @@ def test_exclusive_cells_run_alone_and_last(cell: MakeCell, tmp_path: Path) -> N
     shared = cell("t", wait=0.3)
     timing = replace(shared, command=replace(shared.command, exclusive=True))
     other = replace(timing, name="u")
-    after = cell("c", add=CellFigure("u", ("total",)))
+    after = cell("c", add=CellMetric("u", ("total",)))
     lines: list[str] = []
     cells = [timing, other, cell("a", wait=0.5), cell("b", wait=0.1), after]
     run(cells, tmp_path / "out", jobs=3, say=lines.append)

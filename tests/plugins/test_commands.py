@@ -16,7 +16,7 @@ from huggingface_hub import HfApi
 from egovcp import spec
 from egovcp.artifact import load_artifact
 from egovcp.checks import check_artifact
-from egovcp.data.pictures import decode_frames
+from egovcp.data.camera_images import decode_frames
 from egovcp.manifest import PROCESSORS
 from egovcp.robot.stance import StanceController
 from lerobot_policy_egovcp import EgovcpPolicy

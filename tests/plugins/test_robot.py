@@ -44,7 +44,7 @@ def config(tmp_path: Path, bridge: int = 1, command: int = 1, camera: int = 1) -
         camera=CameraOptions(server=ZmqCameraConfig(port=camera)),
         controller="stance",
         limits=PATIENT,
-        by_itself=True,
+        auto_start=True,
     )
 
 
@@ -161,8 +161,8 @@ def test_lerobot_rollout_plays_a_policy_on_it(
         "policy.path": artifact,
         "policy.device": "cpu",
         "robot.type": "egovcp_g1",
-        "robot.suffix": ".vel",
-        "robot.by_itself": "true",
+        "robot.name_suffix": ".vel",
+        "robot.auto_start": "true",
         "robot.calibration_dir": fake.calibration_dir,
         "robot.bridge.state_port": fake.bridge.state_port,
         "robot.bridge.command_port": fake.bridge.command_port,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy
@@ -199,12 +200,20 @@ def test_an_artifact_of_egovcp_train_can_be_trained_further(
     ],
 )
 def test_weights_of_another_return_are_refused_for_training(
-    returns: ReturnConfig, found: str, artifact: Path, config: EgovcpConfig,
-    meta: LeRobotDatasetMetadata,
-) -> None:  # fmt: skip
+    returns: ReturnConfig, found: str, artifact: Path, meta: LeRobotDatasetMetadata
+) -> None:
+    config = PreTrainedConfig.from_pretrained(artifact)
     config.returns, config.pretrained_path = returns, artifact
     with pytest.raises(UsageError, match=rf"--policy\.returns\.{found}"):
         make_policy(config, ds_meta=meta)
+
+
+def test_object_losses_of_a_policy_without_object_head_are_refused(artifact: Path) -> None:
+    flags = ["--world_model.loss.multistep_object=1"]
+    config = PreTrainedConfig.from_pretrained(artifact, cli_overrides=flags)
+    with pytest.raises(UsageError, match=r"no object head .*\.loss\.multistep_object=0"):
+        EgovcpPolicy.from_pretrained(artifact, config=config)
+    assert config.world_model.loss.multistep_object == 1
 
 
 def test_rows_of_files_that_were_not_downloaded_are_not_valid(tmp_path: Path) -> None:

@@ -9,6 +9,51 @@ import pytest
 
 import egovcp.sim.tasks.registry as registry
 
+#: A post that is always there.
+SOURCE = '''
+import mujoco, numpy as np
+from dataclasses import dataclass
+from egovcp.sim.tasks import *
+
+@dataclass(frozen=True)
+class PostConfig(TaskConfig):
+    """A post."""
+    distance_range: Range = bounded((2.0, 3.0), least=0.5, most=9)
+    """Post before the pelvis, m."""
+
+class PostTask(Task):
+    name = "post"
+    description = "leave a post alone"
+    terms = {"touch": "block"}
+    config: PostConfig = PostConfig()
+    episode = EpisodeConfig(ticks=6, event_ticks=(1, 2), empty_probability=0.5)
+
+    def __init__(self, config, scenario, robot):
+        super().__init__(config, scenario, robot)
+        self.sample("distance")
+
+    @classmethod
+    def add_objects(cls, spec):
+        body = spec.worldbody.add_body(name="post", mocap=True, pos=[20, 0, 1])
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
+        body.add_geom(name="post", type=kind, size=[0.1, 1, 0], contype=1, conaffinity=0)
+
+    def place(self):
+        self.robot.data.mocap_pos[-1] = [self.parameters["distance"], 0, 1]
+
+    def rewards(self):
+        return {"touch": 0.25}
+
+    @property
+    def achieved(self):
+        return True
+
+    @property
+    def object_w(self):
+        return self.robot.data.mocap_pos[-1].copy()
+'''
+ENTRY = "post = post_task:PostTask"
+
 
 def install(
     folder: Path, name: str, source: str, entry: str, monkeypatch: pytest.MonkeyPatch

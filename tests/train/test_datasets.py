@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 
 from egovcp.artifact import load_artifact
 from egovcp.data import DatasetWriter, Provenance
+from egovcp.robot_spec import G1
 from egovcp.testing import random_episode
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.train import main
@@ -131,6 +133,28 @@ def test_auto_mode_is_recorded_and_kept_on_resume(
     saved = (tmp_path / "run" / "train_config.yaml").read_text(encoding="utf-8")
     assert f"mode: {mode}" in saved
     assert main([f"--output_dir={tmp_path / 'run'}", "--resume", "--steps=2"]) == 0
+
+
+def test_memory_is_estimated_from_the_frames_of_the_robot(
+    arguments: Arguments,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """60 kB each, nine times those of the G1."""
+    root, robot = tmp_path / "arm", replace(G1, robot_type="arm", depth=(144, 208))
+    with DatasetWriter(root, Provenance("stance-test", seed=1)) as writer:
+        for number in range(3):
+            writer.add(random_episode(number, 8, seed=1, robot=robot))
+    argv = arguments(tmp_path / "run", dataset__root=root, steps=1)
+    with monkeypatch.context() as patch:
+        patch.setattr("egovcp.hardware.available_bytes", lambda: 10**6)
+        assert main(argv) == 2
+    assert "--batch_size=2 with --sampling.length=6 takes at least" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    monkeypatch.setattr("egovcp_train.datasets.available_bytes", lambda: 10**6)
+    assert main(argv) == 0
+    assert "mode: stream" in (tmp_path / "run" / "train_config.yaml").read_text(encoding="utf-8")
 
 
 # --- faults -----------------------------------------------------------------------------------

@@ -1,12 +1,18 @@
-"""The device of a run, and freed memory, which is reused without page faults."""
+"""The device of a run, its memory, and freed memory, which is reused without page faults."""
 
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import torch
 
-from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp_train import device
+from egovcp.errors import ArtifactError, EnvironmentFailure, UsageError
+from egovcp_train import checkpoint, device
+from egovcp_train.loop import Learner
+from egovcp_train.train import main
+from tests.support.arguments import Arguments
 
 PROGRAM = """
 import resource
@@ -32,6 +38,40 @@ def test_a_device_that_cannot_be_used_is_refused(name: str) -> None:
         device.choose_device(name)
     with pytest.raises(UsageError, match="unknown --device"):
         device.choose_device("abacus")
+
+
+def _fill_gpu(*_: object) -> None:
+    raise torch.OutOfMemoryError("CUDA out of memory")
+
+
+def _fill_cpu(*_: object) -> None:
+    torch.empty(1 << 55)
+
+
+@pytest.mark.parametrize("fill", [_fill_gpu, _fill_cpu])
+def test_a_full_device_is_an_environment_failure(
+    arguments: Arguments,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    fill: Callable[..., None],
+) -> None:
+    monkeypatch.setattr(Learner, "update", fill)
+    assert main(arguments(tmp_path / "run")) == 5
+    assert "); lower --batch_size, or end other programs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("fill", [_fill_gpu, _fill_cpu])
+def test_a_full_memory_is_not_reported_as_a_wrong_option(
+    tmp_path: Path, fill: Callable[..., None]
+) -> None:
+    with pytest.raises(RuntimeError, match="memory"), checkpoint.restoring(tmp_path):
+        fill()
+    with (
+        pytest.raises(ArtifactError, match=r"not fit .* \(KeyError: 'step'\)"),
+        checkpoint.restoring(tmp_path),
+    ):
+        raise KeyError("step")
 
 
 def _faults() -> int:

@@ -21,7 +21,7 @@ def test_scalars_and_pictures_go_to_tensorboard(arguments: Arguments, tmp_path: 
     content = events.read_bytes()
     for name in (b"loss/total", b"loss/value", b"heldout/latent/kl", b"grad_norm"):
         assert name in content
-    for name in (b"depth_valid_h16", b"state_joint_position_repeat_h4", b"latent_active"):
+    for name in (b"depth_valid_h16", b"state_joint_position_repeat_h4", b"latent_active_share"):
         assert b"heldout/ball/" + name in content
     assert b"heldout/open_loop_ball" in content
     assert b"PNG" in content
@@ -163,8 +163,13 @@ def test_trackio_has_scalars_and_pictures_and_a_resumed_run_goes_on(
     fake.__spec__ = ModuleSpec("trackio", None)
     monkeypatch.setitem(sys.modules, "trackio", fake)
     assert main(arguments(output, "--trackio=hands")) == 0
+    assert main(arguments(tmp_path / "other" / "run", "--trackio=hands", steps=1)) == 0
     assert main([f"--output_dir={output}", "--resume", "--steps=8"]) == 0
-    assert started == [("hands", "run", "never"), ("hands", "run", "allow")]
+    own, other, resumed = started
+    assert own == resumed  # trackio continues the newest run of a name
+    assert own != other
+    assert all(name.startswith("run-") for _, name, _ in started)
+    assert {(project, resume) for project, _, resume in started} == {("hands", "allow")}
     logged = [(name, step) for step, values in run.logged for name in values]
     assert {("loss/total", 6), ("heldout/value_ball", 6), ("loss/total", 8)} <= set(logged)
     assert run.finished

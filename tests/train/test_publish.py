@@ -113,11 +113,12 @@ def test_the_card_credits_metrics_to_a_single_dataset_only(tmp_path: Path) -> No
     (model,) = front["model-index"]
     assert model["results"][0]["dataset"]["name"] == "me/a"
     assert "| `object_rmse_m` | 0.1 | root mean squared error" in text
-    both = [one, {"repo_id": "", "revision": "", "episodes": ""}]
-    options = {"datasets": [{"repo_id": "me/a"}, {"root": "data/local"}]}
+    both = [one, *({"repo_id": name, "revision": "", "episodes": ""} for name in ("", "me/c"))]
+    options = {"datasets": [{"repo_id": "me/a"}, {"root": "data/local"}, {"repo_id": "me/c"}]}
     front, text = _card(tmp_path / "both", G1, datasets=both, train_config=options)
     assert "model-index" not in front
     assert "| dataset | a local folder, `local` |" in text
+    assert "| dataset | `me/c`, in a local folder |" in text
 
 
 def test_a_run_that_is_not_published_has_its_card_too(arguments: Arguments, tmp_path: Path) -> None:

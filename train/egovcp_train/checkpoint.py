@@ -35,8 +35,8 @@ from egovcp.flags import read_config
 from egovcp.model import WorldModel
 from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.outputs import require_writable
-from egovcp.removed_options import RemovedOptionError
 from egovcp.values import build, convert
+from egovcp_train.device import is_full_memory
 
 CONFIG_FILE: Final = "train_config.yaml"
 STATE_FILE: Final = "state.pt"
@@ -75,10 +75,6 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
         build(config_class, options, "--")
     except OSError as error:
         raise ArtifactError(f"{saved}: cannot be read: {error.strerror}; {_REMEDY}") from error
-    except RemovedOptionError as error:
-        raise ArtifactError(
-            f"{saved}: {error}; a run of an older version cannot be resumed: start a new one"
-        ) from error
     except (UsageError, ValueError) as error:
         raise ArtifactError(f"{saved}: {error}; {_REMEDY}") from error
     preset, stored = given.get("preset"), options.get("preset")
@@ -196,9 +192,9 @@ def restoring(output_dir: Path) -> Iterator[None]:
     """
     try:
         yield
-    except torch.OutOfMemoryError:
-        raise
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if is_full_memory(error):
+            raise
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         raise ArtifactError(
             f"{output_dir}: its checkpoint does not fit the options given, or is of another "

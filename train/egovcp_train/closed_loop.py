@@ -21,31 +21,35 @@ if TYPE_CHECKING:
 
 ROBOTS: Final = 8  # side by side
 
-type Played = tuple[NDArray[np.float64], NDArray[np.bool_]]
+type Outcome = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Return and success (B,) of the episodes played side by side."""
 
 
 class ClosedLoop:
     """Plays the same scenarios of each task with any model."""
 
     def __init__(self, tasks: Sequence[str], episodes: int, seed: int, controller_id: str) -> None:
-        """Raises `UsageError` unless ``controller_id`` is that of a controller of egovcp."""
-        self._controller = _named(controller_id, tasks)
+        """Raises `UsageError` unless ``controller_id`` is that of a controller of egovcp; for tasks
+        of another robot than the G1 it is ignored."""
+        self._controller = _controller_name(controller_id, tasks)
         self._tasks, self._episodes, self._seed = tuple(tasks), episodes, seed
 
     def play(self, model: WorldModel, planner: PlannerConfig) -> dict[str, float]:
         """``TASK/return``, the mean sum of rewards, and ``TASK/success``, a share."""
-        found: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         for task in self._tasks:
-            every = [Scenario(task, VALIDATION + self._seed, i) for i in range(self._episodes)]
-            parts = [self._together(model, planner, part) for part in batched(every, ROBOTS)]
-            returns, successes = (np.concatenate(x) for x in zip(*parts, strict=True))
-            found[f"{task}/return"] = float(returns.mean())
-            found[f"{task}/success"] = float(successes.mean())
-        return found
+            scenarios = [Scenario(task, VALIDATION + self._seed, i) for i in range(self._episodes)]
+            outcomes = [
+                self._play_side_by_side(model, planner, part) for part in batched(scenarios, ROBOTS)
+            ]
+            returns, successes = (np.concatenate(x) for x in zip(*outcomes, strict=True))
+            metrics[f"{task}/return"] = float(returns.mean())
+            metrics[f"{task}/success"] = float(successes.mean())
+        return metrics
 
-    def _together(
+    def _play_side_by_side(
         self, model: WorldModel, planner: PlannerConfig, scenarios: Sequence[Scenario]
-    ) -> Played:
+    ) -> Outcome:
         from egovcp.sim.config import evaluation_config
         from egovcp.sim.robot_env import make_env
 
@@ -54,8 +58,8 @@ class ClosedLoop:
         return _play(env, Policy(model, planner, len(scenarios), self._seed), scenarios)
 
 
-def _play(env: BaseVectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Played:
-    """Return and success (B,) each of one episode per row."""
+def _play(env: BaseVectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Outcome:
+    """Play one episode per row."""
     observation = env.reset(scenarios)
     returns = np.zeros(len(scenarios))
     success: NDArray[np.bool_] = np.zeros(len(scenarios), dtype=np.bool_)
@@ -68,8 +72,9 @@ def _play(env: BaseVectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> 
     return returns, success
 
 
-def _named(controller_id: str, tasks: Sequence[str]) -> str:
-    """The name of the shipped controller of the G1 with this id; another robot has its own."""
+def _controller_name(controller_id: str, tasks: Sequence[str]) -> str:
+    """The name of the shipped controller of the G1 with this id; another robot has its own, and
+    ignores the name."""
     from egovcp.robot.controllers import STANCE, WALK, make_controller
     from egovcp.sim.base_env import one_robot
 

@@ -77,8 +77,8 @@ class LoadingConfig:
     """How episodes are loaded during training."""
 
     mode: Literal["auto", "ram", "stream"] = "auto"
-    """ram: all in memory, 6.3 kB per frame; stream: read through a shuffle window from the disk, or
-    file by file from the Hub; auto: ram if half of the free memory is enough."""
+    """ram: all in memory, 6.3 kB per frame of the G1; stream: read through a shuffle window from
+    disk, or file by file from the Hub; auto: ram if half of the free memory is enough."""
     shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
     """Shuffle window of mode stream."""
     sample_files: int = bounded(16, least=1, most=65_536)

@@ -26,6 +26,7 @@ from egovcp.data import (
     sample_files,
 )
 from egovcp.data.convert import convert_dataset
+from egovcp.data.episode import frame_bytes
 from egovcp.data.lerobot import is_own
 from egovcp.data.samplers import PrefetchIterator
 from egovcp.data.schema import INFO_PATH
@@ -35,21 +36,17 @@ from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
 from egovcp.hardware import available_bytes, require_memory
 from egovcp.model import Batch, WorldModel
+from egovcp.robot_spec import RobotSpec
 from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
 
 EVALUATION_EPISODES: Final = 512
 """At most this many held-out episodes of each task; with fewer, R2 of Q depends on which ones they
 are."""
-FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
-    spec.STATE_DIM + 2 * spec.ACTION_DIM + 8
-)
-"""Bytes per frame of the G1, an estimate for other robots."""
-
 _BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _RETURNS: Final = ReturnConfig()
 
-type Built = tuple[PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore]]
+type Loaded = tuple[PrefetchIterator, EpisodeStore, Callable[[], EpisodeStore]]
 
 
 @dataclass(frozen=True)
@@ -87,12 +84,12 @@ def check_options(config: TrainConfig) -> None:
     config.returns.check()
 
 
-def require_batch_memory(config: TrainConfig, device: torch.device) -> None:
-    """Raise `UsageError` for a batch that is too large for this machine."""
+def require_batch_memory(config: TrainConfig, device: torch.device, robot: RobotSpec) -> None:
+    """Raise `UsageError` for a batch of ``robot``'s data that is too large for this machine."""
     size, length = config.batch_size, config.sampling.length
     option = f"--batch_size={size} with --sampling.length={length}"
     copies = _BATCH_COPIES if device.type == "cpu" else 1
-    require_memory(option, size * length * copies * FRAME_BYTES)
+    require_memory(option, size * length * copies * frame_bytes(robot))
 
 
 def prepare(
@@ -240,12 +237,13 @@ def _resolved(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainCon
     """The options with the mode that auto selects here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES
+    index = EpisodeIndex.of(readers)
+    needed = index.num_frames * frame_bytes(index.robot)
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
 
-def _in_memory(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Built:
+def _in_memory(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Loaded:
     training, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
@@ -255,7 +253,7 @@ def _in_memory(readers: Sequence[DatasetReader], config: TrainConfig, model: Wor
     return PrefetchIterator(sampler), heldout, lambda: training
 
 
-def _on_disk(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Built:
+def _on_disk(readers: Sequence[DatasetReader], config: TrainConfig, model: WorldModel) -> Loaded:
     training, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = training
     if training.is_remote:

@@ -48,11 +48,18 @@ def reporting_full_memory() -> Iterator[None]:
     """Raise `EnvironmentFailure` if the memory of the device does not suffice for the block."""
     try:
         yield
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:
+        if not is_full_memory(error):
+            raise
         raise EnvironmentFailure(
             f"the memory of the device does not suffice ({_reason(error)}); lower --batch_size, or "
             "end other programs that use the device"
         ) from error
+
+
+def is_full_memory(error: Exception) -> bool:
+    """Whether the memory of a device is exhausted; torch has no class for that of the CPU."""
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)
 
 
 def _reason(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from egovcp_train.config import TrainConfig
 
 RUN_ID: Final = "wandb/run_id.txt"
+RUN_NAME: Final = "trackio/run_name.txt"
 
 
 @dataclass(frozen=True)
@@ -95,15 +97,19 @@ class _RunLogger(Logger):
 
 
 class TrackioLogger(_RunLogger):
-    """Logs to Trackio on this machine; the run is named after the output folder; `--resume`
-    continues it."""
+    """Logs to one run of Trackio on this machine; a resumed training continues it.
+
+    Trackio continues the newest run of a name, so the name, which is stored in ``output``, is that
+    of this folder and a random suffix.
+    """
 
     def __init__(self, output: Path, project: str, options: Mapping[str, Any]) -> None:
         import trackio  # an optional package
 
-        resume = "allow" if options["resume"] else "never"
-        run = trackio.init(project, output.name, config=dict(options), resume=resume)
+        name = _stored(output / RUN_NAME) or f"{output.name}-{secrets.token_hex(4)}"
+        run = trackio.init(project, name, config=dict(options), resume="allow")
         super().__init__(trackio, run)
+        _store(output / RUN_NAME, name)
 
 
 class WandbLogger(_RunLogger):
@@ -117,10 +123,9 @@ class WandbLogger(_RunLogger):
         """
         import wandb  # an optional package
 
-        stored = output / RUN_ID
         try:
             run = wandb.init(
-                id=config.run_id or (stored.read_text("utf-8") if stored.is_file() else None),
+                id=config.run_id or _stored(output / RUN_ID),
                 project=config.project,
                 entity=config.entity or None,
                 notes=config.notes or None,
@@ -138,14 +143,22 @@ class WandbLogger(_RunLogger):
             ) from error
         super().__init__(wandb, run)
         self._upload = not config.disable_artifact
-        stored.parent.mkdir(parents=True, exist_ok=True)
-        stored.write_text(run.id, encoding="utf-8")
+        _store(output / RUN_ID, run.id)
 
     def log_policy(self, step: int, folder: Path) -> None:
         if self._upload:
             artifact = self._package.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
             artifact.add_dir(str(folder))
             self._run.log_artifact(artifact)
+
+
+def _stored(path: Path) -> str | None:
+    return path.read_text("utf-8") if path.is_file() else None
+
+
+def _store(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
 
 
 def make_loggers(config: TrainConfig, output: Path) -> list[Logger]:

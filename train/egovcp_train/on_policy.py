@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, nullcontext, redirect_stdout
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +117,7 @@ class OnPolicyLearner(ABC):
 
         self.env, self.iteration = env, 0
         self.ticks: int = config["num_steps_per_env"]
-        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
+        with redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
             self.ppo = PPO.construct_algorithm(env.get_observations(), env, config, "cpu")
         shrink_output(self.ppo.get_policy().mlp)
         self.ppo.train_mode()
@@ -203,7 +203,6 @@ def run_iterations(
     output.mkdir(parents=True, exist_ok=True)
     save_config(replace(config, resume=False), str(output / CONFIG_FILE))
     budget = Budget(config.steps, config.max_minutes, spent=float(state.get("seconds", 0.0)))
-    logger = TensorBoardLogger(output) if config.tensorboard else None
 
     def save() -> None:
         state = learner.state_dict() | {"seconds": budget.spent}
@@ -211,7 +210,9 @@ def run_iterations(
             write_policy(folder)
 
     start = learner.iteration
+    tensorboard = closing(TensorBoardLogger(output)) if config.tensorboard else nullcontext()
     with (
+        tensorboard as logger,
         stop_on_signal() as stopped,
         tqdm(
             total=budget.steps,
@@ -231,18 +232,18 @@ def run_iterations(
             bar.update(learner.steps - bar.n)
             if learner.iteration % config.save_freq == 0:
                 save()
-    if learner.iteration > start and learner.iteration % config.save_freq:
-        save()
-    if logger:
-        logger.close()
+        final = checkpoint_dir(output, learner.iteration)
+        has_learned = learner.iteration > start
+        if (has_learned and learner.iteration % config.save_freq) or not final.exists():
+            save()
     finished = budget.progress(learner.steps) >= 1.0
-    folder = checkpoint_dir(output, learner.iteration) / "pretrained_model"
-    echo(final_message(folder, "done" if finished else "stopped early"))
+    outcome = "done" if finished else "stopped early"
+    echo(final_message(final / "pretrained_model", outcome))
     if not finished:
         raise KeyboardInterrupt
 
 
-@contextlib.contextmanager
+@contextmanager
 def _divergence_reported(learner: OnPolicyLearner, output: Path) -> Iterator[None]:
     """Raise `DataError` if a weight is not finite at the end of the block, or after an error in
     it."""

@@ -109,7 +109,6 @@ def train(config: TrainConfig) -> None:
     _require_one_process()
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    require_batch_memory(config, device)
     output = _prepare_output(config)
     reserve_policy(config.policy)
     keep_freed_memory()
@@ -131,6 +130,7 @@ def _prepare_run(
     """Load the data, build or restore the learner, and write the options of the run."""
     readers = open_readers(config)
     robot = readers[0].robot
+    require_batch_memory(config, device, robot)
     model = WorldModel(config.policy.world_model(robot), robot)
     initial: dict[str, Tensor] = {}
     if config.policy.pretrained_path and not config.resume:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from huggingface_hub import DatasetCard, DatasetCardData
 
+from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.data.destination import require_outside
 from egovcp.data.provenance import source_provenances
@@ -71,6 +72,7 @@ def run_card(config: CardConfig) -> None:
     output.parent.mkdir(parents=True, exist_ok=True)
     write_text(output, _render(reader, config.repo_id, statistics, plots))
     echo(f"wrote {output} and {len(paths)} plots in {output.parent / assets}")
+    print_missing_licence(reader)
 
 
 def card_text(reader: DatasetReader, repo_id: str) -> str:
@@ -78,6 +80,21 @@ def card_text(reader: DatasetReader, repo_id: str) -> str:
     paths = {name: f"{ASSETS}/{name}.png" for name in _PLOTS}
     plots = {name: path for name, path in paths.items() if (reader.root / path).is_file()}
     return _render(reader, repo_id, _statistics(reader), plots)
+
+
+def print_missing_licence(reader: DatasetReader) -> None:
+    """Print a hint if the card names no licence: only that of simulated data is known."""
+    if _origin(reader) != "simulated":
+        echo(
+            "the card names no licence, because the data are not known to be simulated; write the "
+            f"card with `egovcp-dataset card` and add `license:` to the top of its {CARD}"
+        )
+
+
+def _origin(reader: DatasetReader) -> str:
+    """`Provenance.origin`; empty if it is not known, or not that of all merged datasets."""
+    origins = {part.origin for part in source_provenances(reader.origin)}
+    return origins.pop() if len(origins) == 1 else ""
 
 
 def _statistics(reader: DatasetReader) -> DatasetStatistics | None:
@@ -106,7 +123,7 @@ def _render(
     robot_tags = [robot.robot_type, *(["humanoid"] if robot.is_g1 else [])]
     card = DatasetCard.from_template(
         DatasetCardData(
-            license="apache-2.0",
+            license="apache-2.0" if _origin(reader) == "simulated" else None,
             task_categories=["robotics"],
             tags=["LeRobot", "egovcp", *robot_tags, "depth", "world-model"],
             size_categories=[_size_category(reader.num_frames)],
@@ -116,6 +133,11 @@ def _render(
         template_str=(files(__package__) / "card_template.md").read_text(encoding="utf-8"),
         dataset=name.partition("/")[2],
         robot=robot,
+        origin=_origin(reader),
+        converted_from=config.get("converted_from"),
+        features=reader.features,
+        reward_terms=spec.REWARD_TERMS,
+        rate_limit=spec.ACTION_RATE_LIMIT,
         tasks=[{"name": task, "about": describe_task(task)} for task in tasks],
         episodes=len(reader),
         frames=reader.num_frames,
@@ -130,7 +152,7 @@ def _render(
         controller_id=reader.controller_id,
         eta=config.get("eta") if len(parts) == 1 or config.keys() >= _WALK else None,
         boundary=_BOUNDARY.get(config.get("boundary", ""), "kept inside the box"),
-        step_ticks=f", a step every {shortest} to {longest} ticks" if longest > 1 else "",
+        interval=f"{shortest} to {longest}" if longest > 1 else "",
         ranges=ranges,
         constants=constants,
         coverage=coverage_table(statistics.tasks) if statistics else "",

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.checks.lerobot_episode import Statistics, describe, nonfinite_problem
+from egovcp.checks.lerobot_episode import Statistics, describe
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
 from egovcp.data.destination import require_outside
-from egovcp.data.features import values_of
+from egovcp.data.features import nonfinite_problem, values_of
 from egovcp.data.lerobot import LeRobotReader, is_own
 from egovcp.data.source import locate
 from egovcp.data.stats import aggregate_named

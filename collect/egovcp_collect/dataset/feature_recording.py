@@ -11,9 +11,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.data import schema
+from egovcp.data.camera_images import camera_images
 from egovcp.data.features import Feature, values_of
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader
-from egovcp.data.pictures import camera_images
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.files import removed_on_error
 from egovcp.packages import require_packages

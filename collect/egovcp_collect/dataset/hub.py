@@ -19,7 +19,7 @@ from egovcp.errors import DataError, UsageError
 from egovcp.hub import Content, PublishConfig, RetryPolicy, fetch, is_repo_id, resolve
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
-from egovcp_collect.dataset.card import ASSETS, CARD, card_text
+from egovcp_collect.dataset.card import ASSETS, CARD, card_text, print_missing_licence
 from egovcp_collect.progress import progress_bar
 
 #: Folders of a LeRobot dataset: other files in them on the Hub belong to an earlier version.
@@ -83,6 +83,7 @@ def run_push(config: DatasetPushConfig) -> None:
         echo(f"{CARD} is published as it is; `egovcp-dataset card` writes it anew")
     else:
         contents[CARD] = Content(card_text(reader, config.repo_id).encode())
+        print_missing_licence(reader)
     commit = config.publish(
         contents,
         f"{size}: {', '.join(tasks)}",

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from egovcp.checks.lerobot_dataset import LeRobotCheck
 from egovcp.checks.lerobot_episode import Statistics, describe
 from egovcp.data import dataset_files, schema
+from egovcp.data.camera_images import decode_frames, decode_image, frame_times
 from egovcp.data.features import Feature
 from egovcp.data.lerobot import EpisodeRow, LeRobotReader, VideoSpan
 from egovcp.data.paths import files_below
-from egovcp.data.pictures import decode_frames, decode_image, frame_times
 from egovcp.data.stats import QUANTILES, ROWS, aggregate_named
 from egovcp.data.writer import new_dataset
 from egovcp.errors import DataError

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.checks.lerobot_episode import nonfinite_problem
 from egovcp.data import (
     DatasetReader,
     Episode,
@@ -20,7 +19,7 @@ from egovcp.data import (
     mc_valid,
     schema,
 )
-from egovcp.data.features import parse_feature
+from egovcp.data.features import nonfinite_problem, parse_feature
 from egovcp.data.parquet import Columns
 from egovcp.errors import DataError
 from egovcp.robot.kinematics import palm_positions

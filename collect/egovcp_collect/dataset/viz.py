@@ -15,7 +15,7 @@ from egovcp.files import removed_on_error, user_path
 from egovcp.log.tick import Sink
 from egovcp.outputs import output_file, require_writable
 from egovcp.packages import require_packages
-from egovcp.rollouts import POSE, run_info, ticks_of
+from egovcp.rollouts import POSE, recording_info, ticks_of
 from egovcp.terminal import echo
 
 
@@ -103,7 +103,7 @@ def write_recording(reader: DatasetReader, index: int, output: Path, meshes: boo
         sink: Sink = McapSink(output)
     else:
         sink = RerunSink(output, meshes=meshes, signals=True)
-    sink.open(run_info(reader, index, episode))
+    sink.open(recording_info(reader, index, episode))
     with removed_on_error(output):
         for tick in ticks_of(episode):
             sink.write(tick)

@@ -2,7 +2,7 @@
 
 Every second control tick is a planner tick t: o_t goes to the planner, whose plan is taken as soon
 as it arrives, at the latest when o_{t+1} is due. So an action takes effect one or two control ticks
-after its observation, as in the training data. The loop never blocks.
+after its observation, within the 0 to 2 ticks of the training data. The loop never blocks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from egovcp_deploy.robots.base import Array, LowState, MotorCommand, propriocept
 from egovcp_deploy.robots.bridge import BridgeRobot
 
 #: N m s/rad in DAMP: legs and waist let a standing robot sink in about a second.
-DAMPED: Final = np.concatenate([np.full(15, 8.0), np.full(NUM_JOINTS - 15, 2.0)])
+DAMP_GAINS: Final = np.concatenate([np.full(15, 8.0), np.full(NUM_JOINTS - 15, 2.0)])
 #: Bounds of vx, vy (m/s) and yaw rate (rad/s) in the heading frame, which the walking controller is
 #: evaluated at (docs/lowlevel.md), and of their change per s.
 VELOCITY_LOW: Final = (-0.3, -0.2, -0.6)
@@ -47,7 +47,7 @@ def _bounded(position: NDArray[np.floating]) -> Array:
 def damping_command(position: NDArray[np.floating] | None, mode: int) -> MotorCommand:
     """Damping without stiffness; ``position`` (29,) rad of the joints, None: unknown."""
     where = np.zeros(NUM_JOINTS) if position is None else position
-    return MotorCommand(_bounded(where), np.zeros(NUM_JOINTS), DAMPED, mode)
+    return MotorCommand(_bounded(where), np.zeros(NUM_JOINTS), DAMP_GAINS, mode)
 
 
 def ramp_command(
@@ -57,7 +57,8 @@ def ramp_command(
     ``target`` (29,) rad."""
     share = min(max(share, 0.0), 1.0)
     position = (1 - share) * _bounded(start) + share * _bounded(target)
-    return MotorCommand(position, share * stiffness, (1 - share) * DAMPED + share * damping, mode)
+    damping = (1 - share) * DAMP_GAINS + share * damping
+    return MotorCommand(position, share * stiffness, damping, mode)
 
 
 # --- base velocity -----------------------------------------------------------------------

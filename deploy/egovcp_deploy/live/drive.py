@@ -30,13 +30,13 @@ from egovcp_deploy.live.processes import running_control, stop_control
 from egovcp_deploy.options import make_output_dir
 from egovcp_deploy.pilot.planner import PlannerRunner, backend_of, leave_core
 from egovcp_deploy.recording import (
+    make_run_info,
     missing_ticks,
     open_viewer,
     percentiles,
     print_viewer_command,
-    provenance,
+    provenance_fields,
     recording,
-    run_info,
 )
 
 
@@ -51,7 +51,7 @@ def drive(config: DeployConfig, artifact: Artifact) -> None:
     policy = artifact.make_policy(1, config.seed)
     runner = PlannerRunner(policy, config.imagine)
     runner.warm_up()
-    info = run_info(config, controller_id, artifact, backend_of(policy))
+    info = make_run_info(config, controller_id, artifact, backend_of(policy))
     with ExitStack() as signals:
         try:
             with (
@@ -124,7 +124,7 @@ def _report(summary: LiveSummary, sink: Sink, info: RunInfo, robot: str) -> dict
         "damped": summary.damped,
         "failure": "" if summary.failure is None else describe_failure(summary.failure),
         "events": summary.events,
-        **provenance(info),
+        **provenance_fields(info),
     }
 
 

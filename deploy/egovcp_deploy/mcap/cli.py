@@ -22,6 +22,7 @@ COMMANDS: Final = CommandGroup(
             "egovcp_deploy.mcap.to_dataset:run",
             "convert rollouts to a new LeRobot dataset for training (--dataset.root)",
             more="files",
+            takes_argv=True,
         ),
     },
 )

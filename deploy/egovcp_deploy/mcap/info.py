@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 from collections import Counter
@@ -12,11 +13,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.errors import UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
 from egovcp.log.mcap_reader import RecordingReader
 from egovcp.log.messages import Topic
-from egovcp.log.tick import MODES
+from egovcp.log.tick import MODES, MotorReadings
 from egovcp.outputs import STDOUT, output_file, require_not_input, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
@@ -25,6 +26,7 @@ from egovcp.terminal import echo, echo_lines
 _MODE: Final = "|".join(MODES)
 _CHANGE: Final = re.compile(rf"(?P<before>{_MODE}) -> (?P<after>{_MODE}): (?P<reason>.*)")
 _SHOWN_GAPS: Final = 10
+_TEMPERATURES: Final = ((), (NUM_JOINTS, 1), (NUM_JOINTS, 2))  # shapes; empty: not reported
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,7 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
             if match := _CHANGE.fullmatch(line):
                 states.append({"time_s": (raw.time_ns - first_ns) / NS_PER_S, **match.groupdict()})
         if (motors := raw.motors()) is not None:
+            _require_joints(motors, raw.index)
             torque = np.fmax(torque, np.abs(motors.torque))
             if motors.temperature is not None:
                 temperature = np.fmax(temperature, np.fmax.reduce(motors.temperature, axis=1))
@@ -71,7 +74,7 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
     joint_maxima = None
     if np.isfinite(torque).any():
         joint_maxima = {
-            name: {"torque_nm": most, "temperature_deg_c": None if np.isnan(degrees) else degrees}
+            name: {"torque_nm": _finite(most), "temperature_deg_c": _finite(degrees)}
             for name, most, degrees in zip(
                 JOINT_NAMES, torque.tolist(), temperature.tolist(), strict=True
             )
@@ -104,6 +107,21 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
     return report, reader
 
 
+def _require_joints(motors: MotorReadings, tick: int) -> None:
+    """Raise `DataError` unless the readings are those of a G1's motors."""
+    temperatures = () if motors.temperature is None else motors.temperature.shape
+    if motors.torque.shape != (NUM_JOINTS,) or temperatures not in _TEMPERATURES:
+        raise DataError(
+            f"tick {tick} has torques of {len(motors.torque)} joints and temperatures of shape "
+            f"{temperatures}, expected {NUM_JOINTS} joints; the recording is damaged"
+        )
+
+
+def _finite(value: float) -> float | None:
+    """``value``; None, which JSON has, if it is not finite."""
+    return value if math.isfinite(value) else None
+
+
 def as_text(report: dict[str, Any]) -> list[str]:
     """The report of `summarise` as lines of text."""
     condition = "complete" if report["complete"] else "TRUNCATED"
@@ -134,9 +152,10 @@ def as_text(report: dict[str, Any]) -> list[str]:
         width = max(map(len, JOINT_NAMES))
         lines.append(f"{'joint':{width}}  max torque  max temperature")
         for name, most in report["joint_maxima"].items():
-            degrees = most["temperature_deg_c"]
+            newtons, degrees = most["torque_nm"], most["temperature_deg_c"]
+            force = "" if newtons is None else f"{newtons:6.1f} N m"
             heat = "" if degrees is None else f"{degrees:.0f} deg C"
-            lines.append(f"{name:{width}}  {most['torque_nm']:6.1f} N m  {heat}".rstrip())
+            lines.append(f"{name:{width}}  {force:10}  {heat}".rstrip())
     lines.append("topics")
     width = max(map(len, report["topics"]), default=0)
     for topic, each in report["topics"].items():

@@ -16,7 +16,7 @@ from egovcp.dataset_options import DatasetConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CONTROLLER, Tick
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.terminal import echo, echo_lines
 from egovcp_deploy.pilot.states import State
@@ -53,7 +53,7 @@ class ToDatasetConfig:
     begins in the neutral pose)."""
 
 
-def run(config: ToDatasetConfig) -> None:
+def run(config: ToDatasetConfig, argv: Sequence[str]) -> None:
     """Convert the recordings and print what was kept. Raises `UsageError` without files or for an
     existing dataset, `DataError` for a file that is damaged, has gaps or another controller, or
     repeats another, and `EnvironmentFailure` if a package is missing."""
@@ -76,7 +76,7 @@ def run(config: ToDatasetConfig) -> None:
         return
     seen: list[tuple[Path, list[bytes]]] = []
     converted = []
-    with DatasetWriter(root, provenance(paths)) as writer:
+    with DatasetWriter(root, shared_provenance(paths, shlex.join(argv))) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             require_different(path, episode, seen)
@@ -130,22 +130,23 @@ def _features(row: Mapping[str, Array], mapping: TopicMapping) -> dict[str, Any]
     found: dict[str, Any] = {}
     for key, value in row.items():
         names = mapping.names.get(key)
+        if names and (value.ndim == 3 or len(names) != len(value)):
+            actual = "is an image" if value.ndim == 3 else f"has {len(value)} values"
+            given = f"--mapping: names.{key} has {len(names)} names"
+            raise UsageError(f"{given}, but the feature {actual}")
         if value.ndim == 3:
             found[key] = {"shape": value.shape, **image}
             if value.dtype == "uint16":
                 found[key]["info"] = {"is_depth_map": True}
-        elif names and len(names) != len(value):
-            raise UsageError(f"names.{key} of the mapping: {len(names)} of {len(value)} values")
         else:
             found[key] = {"dtype": str(value.dtype), "shape": value.shape, "names": names}
     return found
 
 
-def provenance(paths: Sequence[Path]) -> Provenance:
+def shared_provenance(paths: Sequence[Path], command: str) -> Provenance:
     """What the recordings have in common; configuration and versions are the first's. Raises
     `DataError` if the low-level controllers differ, or one is not recorded."""
     from egovcp.data import Provenance
-    from egovcp.rollouts import CONTROLLER
 
     infos = {path: RecordingReader(path).info for path in paths}
     ids = {path: info.hashes.get(CONTROLLER, "") for path, info in infos.items()}
@@ -160,11 +161,10 @@ def provenance(paths: Sequence[Path]) -> Provenance:
     first = infos[paths[0]]
     return Provenance(
         controller_id=ids[paths[0]],
-        command=shlex.join(
-            ["egovcp-mcap", "to-dataset", *(str(path.absolute()) for path in paths)]
-        ),
+        command=command,
         versions=dict(first.versions),
         config={name: value for name, value in first.config.items() if name not in _PER_EPISODE},
+        origin="recorded",
     )
 
 
@@ -196,11 +196,9 @@ def read_episode(path: Path, gaps: str) -> tuple[Episode, str]:
         deque(raw_ticks, maxlen=0)  # read on to the end: damage may follow the episode
         reader.require_undamaged()
         kept, gap = _before_gap(ticks, reader.info.fps)
-        if gap and gaps == "refuse":
-            raise DataError(
-                f"{gap}; rows of an episode are one period apart. --gaps=cut keeps what comes "
-                "before the first gap"
-            )
+        if gap and (gaps == "refuse" or not kept):
+            rest = "--gaps=cut keeps what comes before the first gap" if kept else "Nothing is left"
+            raise DataError(f"{gap}; rows of an episode are one period apart. {rest}")
         info = replace(reader.info, task=reader.info.task or UNKNOWN_TASK)
         episode = episode_of(info, kept)
         episode.validate()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import errno
-import io
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -23,6 +22,7 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from egovcp.data.schema import INDEX_FEATURES
+from egovcp.data.tiff import open_image
 from egovcp.errors import DataError, UsageError
 from egovcp.files import UnsafeFileError
 from egovcp.flags import read_config
@@ -127,7 +127,8 @@ class TopicRecording:
         return first + np.arange(count) * NS_PER_S // self._fps
 
     def gap(self) -> tuple[int, str]:
-        """The first row at which a topic has no recent message, and the reason; else all rows."""
+        """(Number of rows before the first gap, which message is missing there); without a gap:
+        (number of all rows, "")."""
         rows, found = self.row_times, [(len(self.row_times), "")]
         for topic in self._paced:
             times = self._times[topic]
@@ -167,7 +168,7 @@ class TopicRecording:
         for topic, steps in self._sources[key]:
             try:
                 parts.append(_values(_part(decoded[topic], steps)))
-            except (LookupError, TypeError, ValueError, OSError) as error:
+            except (LookupError, TypeError, ValueError, DataError) as error:
                 raise DataError(f"{key} from {topic}{steps}: {error}") from error
         if len(parts) > 1 and any(part.ndim > 1 for part in parts):
             raise DataError(f"{key} joins images; expected one image, or numbers")
@@ -236,6 +237,8 @@ def _values(value: Any) -> Array:
     if "data" in fields and ("format" in fields or "encoding" in fields):
         return _image(fields)
     numbers = np.array([*_numbers(value)])
+    if not len(numbers):
+        raise ValueError("no number in it; map another field")
     return numbers if numbers.dtype == np.bool_ else numbers.astype(np.float32)
 
 
@@ -254,12 +257,10 @@ def _image(fields: Mapping[str, Any]) -> Array:
     data = fields["data"]
     data = base64.b64decode(data) if isinstance(data, str) else bytes(data)
     if "format" in fields:
-        from PIL import Image
-
-        image = Image.open(io.BytesIO(data))
-        if image.mode.startswith("I"):
-            return np.asarray(image).astype(np.uint16)[..., None]
-        return np.asarray(image.convert("RGB"))
+        with open_image(data, None, "it") as image:
+            if image.mode.startswith("I"):
+                return np.asarray(image).astype(np.uint16)[..., None]
+            return np.asarray(image.convert("RGB"))
     encoding, rows, columns = fields["encoding"], fields["height"], fields["width"]
     if encoding not in _PIXELS:
         raise ValueError(f"encoding {encoding!r}; expected one of {', '.join(_PIXELS)}")

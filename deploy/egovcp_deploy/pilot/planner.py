@@ -43,11 +43,6 @@ _COMPENSATION: Final = 0.5
 _MIN_SAMPLES: Final = 16
 _MIN_ELITES: Final = 4  # the mean of two follows Q's errors too closely (docs/planner.md)
 _HANDS: Final[tuple[Hand, ...]] = ("left", "right")
-_BACKENDS: Final = {
-    "ReferenceEvaluator": "eager",
-    "FloatEvaluator": "float32",
-    "Int8Evaluator": "int8",
-}
 
 
 class RolloutPolicy(Protocol):
@@ -86,16 +81,13 @@ def backend_of(policy: RolloutPolicy) -> str:
     """Name of the backend that computes the plans, with ``auto`` resolved; empty: no planner."""
     if not isinstance(policy, Policy):
         return ""
-    if policy.config.backend != "auto":
-        return policy.config.backend
-    evaluator = type(policy.prepare()).__name__
-    return _BACKENDS.get(evaluator, evaluator)
+    return policy.prepare().backend
 
 
 def value_maps[L](
     model: Dynamics[L], carry: L, action: NDArray[np.floating], config: PlannerConfig
 ) -> tuple[ValueMap, ...]:
-    """Value of the planned ``action`` (7,) with each hand moved over its box, for one robot whose
+    """J of the planned ``action`` (7,) with each hand moved over its box, for one robot whose
     filtered state is ``carry`` (1, ...)."""
     planned = torch.as_tensor(action, dtype=torch.float32, device=model.min_return.device)
     target = ACTION_BOX.to_metric(np.asarray(action))
@@ -138,7 +130,7 @@ class PlanMessage:
 
     @property
     def actions(self) -> NDArray[np.float64]:
-        """(N, 7) the plan; of a policy that does not plan, its one action."""
+        """(P, 7) the plan; of a policy that does not plan, its one action."""
         return np.asarray(self.step.plan[0] if self.step.plan.size else self.step.action, float)
 
 
@@ -303,7 +295,7 @@ def planner_fields(plan: PlanMessage | None, robot: RobotSpec = G1) -> dict[str,
         return {}
     step, candidates = plan.step, None
     if step.candidates.size and robot.is_g1:
-        actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, N, 7)
+        actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, P, 7)
         hands = ACTION_BOX.to_metric(actions)[..., ACTION_HANDS].reshape(*actions.shape[:2], 2, 3)
         candidates = Candidates(hands, step.candidate_values[0, :LOGGED_CANDIDATES])
     return {

@@ -3,7 +3,8 @@
     INIT -> STAND -> ARMED -> RUN <-> HOLD          any -> DAMP, latched
 
 In DAMP a standing robot collapses to the floor, so it is reserved for what standing cannot
-survive: lost proprioception, a controller without finite targets, a fall, an emergency stop.
+survive: lost proprioception, a controller without finite targets, a motor that dropped out, another
+mode machine, a fall, an emergency stop.
 A robot without planner or camera can still stand: that is HOLD.
 """
 
@@ -53,7 +54,8 @@ class Limits:
     state_hold_s: float = bounded(0.1, above=0)
     """HOLD when proprioception is older, s."""
     state_damp_s: float = bounded(0.2, above=0)
-    """DAMP when proprioception is older, s."""
+    """DAMP when proprioception is older, s. Above 0.5, readings that were rejected as implausible
+    are accepted before, if they agree with each other."""
     image_hold_s: float = bounded(0.2, above=0)
     """HOLD when the depth image is older, s."""
     planner_hold_s: float = bounded(0.14, above=0)
@@ -89,6 +91,7 @@ class Facts:
     skipped: str = ""  # fault of the readings rejected since the last valid one; empty: none
 
 
+_REQUESTED: Final = "requested by the operator"
 _TRANSITIONS: Final = {
     OperatorRequest.STAND: (State.INIT, State.STAND),
     OperatorRequest.ARM: (State.STAND, State.ARMED),
@@ -112,10 +115,10 @@ class Supervisor:
         """Apply ``facts`` and the operator's ``request``; returns log lines of what changed."""
         if self._since_ns is None:
             self._since_ns = facts.time_ns
-        before, self._events = self.state, list[str]()
+        before, reason, self._events = self.state, self.reason, list[str]()
         if self.state is not State.DAMP:
             self._step(facts, request)
-        if self.state is not before:
+        if (self.state, self.reason) != (before, reason):
             self._events.append(f"{before} -> {self.state}: {self.reason}")
         return tuple(self._events)
 
@@ -164,16 +167,23 @@ class Supervisor:
         return ""
 
     def _run_or_hold(self, facts: Facts, request: OperatorRequest | None) -> None:
+        fault = self._hold_reason(facts)
         if request is OperatorRequest.HOLD:
-            self._hold_requested = True
-        elif request is OperatorRequest.RUN:
+            self._hold_requested, self.reason = True, _REQUESTED
+        elif request is OperatorRequest.RUN and self.state is State.HOLD:
             self._hold_requested = False
-        held = request is OperatorRequest.HOLD
-        if reason := "requested by the operator" if held else self._hold_reason(facts):
+            pending = f"run requested, begins after {self.limits.recover_s:g} s without a fault"
+            self.reason = f"{pending}; now: {fault}" if fault else pending
+        elif request is not None:
+            self._refuse(request, f"the robot is in {self.state}")
+        if reason := _REQUESTED if self._hold_requested else fault:
             self._healthy_since_ns = None
             self._enter(State.HOLD, reason, facts)
-        elif self.state is State.HOLD and not self._hold_requested:
+        elif self.state is State.HOLD:
             self._recover(facts)
+
+    def _refuse(self, request: OperatorRequest, objection: str) -> None:
+        self._events.append(f"{request} refused: {objection}")
 
     def _recover(self, facts: Facts) -> None:
         """Return to RUN after `Limits.recover_s` without a fault, so that the state does not
@@ -192,12 +202,12 @@ class Supervisor:
             return
         source, target = _TRANSITIONS[request]
         if source is not self.state:
-            self._events.append(f"{request} refused: the robot is in {self.state}")
+            self._refuse(request, f"the robot is in {self.state}")
         elif objection := self._objection(facts, request):
-            self._events.append(f"{request} refused: {objection}")
+            self._refuse(request, objection)
         else:
             self._hold_requested = False
-            self._enter(target, "requested by the operator", facts)
+            self._enter(target, _REQUESTED, facts)
 
     def _objection(self, facts: Facts, request: OperatorRequest) -> str:
         if facts.state_age_s > self.limits.state_hold_s:

@@ -1,4 +1,4 @@
-"""Interfaces of robots.
+"""Observations, readings and commands of robots.
 
 `SimRobot` and `ReplayRobot` take planner actions and advance time themselves. `BridgeRobot`,
 `ZmqDepthCamera` and `RealSenseDepthCamera` are the motors, IMU and camera of a robot on the wall

@@ -28,10 +28,11 @@ from egovcp_deploy.robots.subscriber import (
     connection_error,
 )
 
-LISTEN_S: Final = 0.5  # readings that are needed for a result
+LISTEN_S: Final = 0.5  # s of readings before `CommandConflictDetector.refusal` can be empty
 GAP_S: Final = 0.2  # a silence after which the statistics start again
 _TIME_CONSTANT_S: Final = 0.3  # of each joint's average
-_MAX_SHARE: Final = 0.35  # of deviating readings; two equal publishers cause about one half
+#: Largest share of deviating readings of one motor; two equal publishers cause about one half.
+_MAX_SHARE: Final = 0.35
 _TOLERANCE: Final = np.maximum(1.0, 0.05 * EFFORT_LIMIT)  # N m
 _RELATIVE_TOLERANCE: Final = 0.5  # gains and torque estimates are rough
 _NO_COMMAND: Final = MotorCommand(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS))
@@ -195,7 +196,7 @@ class BridgeRobot:
         try:
             connect_socket(self._commands, config.host, config.command_port)
             self._subscriber = Subscriber(
-                config.host, config.state_port, wire.MAX_BYTES, self._handle
+                config.host, config.state_port, wire.MAX_BYTES, self._handle, self._reject_message
             )
         except EnvironmentFailure:
             self._context.destroy(linger=0)
@@ -206,17 +207,13 @@ class BridgeRobot:
         assert self._subscriber is not None, "connect first"
         self._subscriber.close()
 
-    def _handle(self, payload: bytes, time_ns: int) -> bool:
-        """Process a message that arrived at ``time_ns``; whether it is a usable reading."""
+    def _handle(self, payload: bytes, time_ns: int, older: int) -> bool:
+        """Process a message that arrived at ``time_ns``; whether it is a usable reading. Raises
+        `wire.MalformedMessage`."""
         if payload == self._payload:  # sensor noise never repeats: the driver is stuck
             return False
         self._payload = payload
-        try:
-            state = wire.decode_state(payload, time_ns)
-        except wire.MalformedMessage as error:
-            self._malformed += 1
-            self._reject(str(error), time_ns)
-            return False
+        state = wire.decode_state(payload, time_ns)
         if problem := self._filter.check(state):
             self._implausible += 1
             self._reject(problem, time_ns)
@@ -232,6 +229,10 @@ class BridgeRobot:
         self._newest = state
         self._rejected = 0
         return True
+
+    def _reject_message(self, problem: str, time_ns: int) -> None:
+        self._malformed += 1
+        self._reject(problem, time_ns)
 
     def _reject(self, problem: str, time_ns: int) -> None:
         self.arrivals.record_loss(time_ns)

@@ -40,7 +40,8 @@ POSITION_UPPER: Final = JOINT_UPPER + _POSITION_MARGIN
 
 WINDOW_S: Final = 0.05
 #: Inconsistent readings that agree with each other for this long are accepted again: the robot has
-#: really moved. Longer than the limit after which the runner damps.
+#: really moved. Longer than the default of `Limits.state_damp_s`, so that a standing robot is
+#: damped before; with a longer limit, it goes on with these readings.
 RESYNC_S: Final = 0.5
 #: The same for readings whose speed has jumped, with positions that contradict nothing.
 JUMP_RESYNC_S: Final = 0.03
@@ -87,9 +88,9 @@ _CURVATURE: Final = np.array(
 _LAG: Final = 0.003  # s
 _JITTER: Final = 0.005  # s
 _MAX_SPEED_TERM: Final = 0.15  # rad
+_FAST: Final = ("ankle_pitch", "shoulder", "elbow", "wrist")
 #: Share of the velocity limit that a joint's speed may jump by. Measured within 5 ms: 11 rad/s of a
 #: knee, 25 of an ankle's pitch, 31 of a shoulder, 6 of the pelvis.
-_FAST: Final = ("ankle_pitch", "shoulder", "elbow", "wrist")
 _SHARE: Final = np.array([1.0 if any(f in n for f in _FAST) else 0.5 for n in JOINT_NAMES])
 _JUMP: Final = np.concatenate([_SHARE * VELOCITY_LIMIT, np.full(3, 6.0)])  # rad/s
 _JUMP_RATE: Final = _columns(1500.0, 700.0)  # rad/s^2

@@ -7,6 +7,7 @@ and the run can be inspected again or shown to another model.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from egovcp.errors import DataError, UsageError
 from egovcp.log.async_sink import warn_on_stderr
 from egovcp.log.mcap_reader import read_recording
+from egovcp.log.tick import CONTROLLER
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
 RECORDING_ENDS: Final = "recording ends"
-_CONTROLLER: Final = "low_level_controller"  # key of its identity
 
 
 class ReplayRobot:
@@ -47,7 +48,7 @@ class ReplayRobot:
             if not recording.ticks:
                 raise DataError(f"{path} has no ticks; there is nothing to play back")
             info = recording.info
-            found = info.hashes.get(_CONTROLLER, "")
+            found = info.hashes.get(CONTROLLER, "")
             if self._number >= 0 and found != self.controller_id:
                 raise DataError(
                     f"{path} was recorded with the low-level controller {found!r}, expected "
@@ -60,7 +61,8 @@ class ReplayRobot:
                     f"warning: {path}: {missing} ticks are missing, and the policy's recurrence "
                     "differs from the recorded one after them; egovcp-mcap info lists the gaps"
                 )
-            self.controller_id, self.spec, self.camera = found, info.robot, info.camera
+            self.info, self.spec, self.camera = info, info.robot, info.camera
+            self.controller_id = found
             self._ticks, self._number = ticks, episode
         self._tick = 0
 
@@ -71,13 +73,15 @@ class ReplayRobot:
         return RobotObservation(tick.depth, state, tick.base, tick.scene)
 
     def act(self, action: NDArray[np.float64]) -> ActionResult:
-        """Return the recorded result, ignoring ``action``, and advance one tick."""
+        """Return the recorded result, ignoring ``action``, and advance one tick. The recorded log
+        lines are marked: they are not those of this rollout."""
         tick = self._ticks[self._tick]
-        truncated, events = tick.truncated, tick.events
+        truncated, events = tick.truncated, [f"recorded: {line}" for line in tick.events]
         if self._tick + 1 < len(self._ticks):
             self._tick += 1
-        elif not tick.terminated:
-            truncated, events = True, events if truncated else (*events, RECORDING_ENDS)
+        elif not (tick.terminated or truncated):
+            truncated = True
+            events.append(RECORDING_ENDS)
         return ActionResult(
             sent=np.asarray(tick.action_sent, np.float64),
             reward=tick.reward,
@@ -85,7 +89,7 @@ class ReplayRobot:
             terminated=tick.terminated,
             truncated=truncated,
             success=tick.success,
-            events=events,
+            events=tuple(events),
         )
 
     def damp(self) -> None:
@@ -108,7 +112,7 @@ def open_recordings(path: Path) -> ReplayRobot:
     return ReplayRobot(found)
 
 
-def _number(path: Path) -> tuple[int, str]:
-    """Sort key that puts rollout-10 after rollout-9."""
-    digits = "".join(c for c in path.stem if c.isdigit())
-    return int(digits or 0), path.name
+def _number(path: Path) -> tuple[list[str | int], str]:
+    """Sort key that puts rollout-10 after rollout-9, and both of run1 before those of run2."""
+    parts = re.split(r"(\d+)", path.stem)  # every second one is a number
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name

@@ -25,6 +25,7 @@ import zmq
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.rate import NS_PER_S
+from egovcp_deploy.robots.wire import MalformedMessage
 
 WINDOW_S: Final = 1.0
 _MAX_ARRIVALS: Final = 5000  # 10 s at 500 Hz
@@ -51,8 +52,8 @@ class ArrivalStats:
 
 
 class ArrivalMonitor:
-    """Records arrival times; thread-safe. Losses are those of `record_loss`, and with
-    ``estimate_losses`` at least as many as intervals of several medians suggest."""
+    """Records arrival times; thread-safe. With ``estimate_losses``, an interval of k median
+    intervals counts as k - 1 losses, if `record_loss` has reported fewer."""
 
     def __init__(self, estimate_losses: bool = True) -> None:
         self._estimate_losses = estimate_losses
@@ -150,15 +151,21 @@ class Subscriber:
     """One subscription with its receiving thread; raises `EnvironmentFailure` if the address is
     invalid. A message beyond ``max_bytes`` ends the connection, which is then renewed.
 
-    ``handle`` is called in the thread with a message and its arrival time (monotonic ns), newest
-    message first, until it returns that one was usable.
+    ``handle`` is called in the thread with a message, its arrival time (monotonic ns) and the
+    number of older messages that arrived with it, newest message first, until it returns that one
+    was usable. No message ends the thread: an exception goes to ``reject``, as text, with the time.
     """
 
     def __init__(
-        self, host: str, port: int, max_bytes: int, handle: Callable[[bytes, int], bool]
+        self,
+        host: str,
+        port: int,
+        max_bytes: int,
+        handle: Callable[[bytes, int, int], bool],
+        reject: Callable[[str, int], None],
     ) -> None:
         self._address = f"tcp://{host}:{port}"
-        self._handle = handle
+        self._handle, self._reject = handle, reject
         self._context = zmq.Context()
         end = self._context.socket(zmq.SUB)
         end.setsockopt(zmq.RCVHWM, _QUEUE)
@@ -169,7 +176,6 @@ class Subscriber:
         except EnvironmentFailure:
             self._context.destroy(linger=0)
             raise
-        self.older = 0  # messages that arrived with the one being handled, and before it
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._receive, args=(end,), daemon=True)
         self._thread.start()
@@ -199,9 +205,13 @@ class Subscriber:
         if len(messages) >= _QUEUE:
             return False
         for older, message in reversed(list(enumerate(messages))):
-            self.older = older
-            if self._handle(message, now):
-                return True
+            try:
+                if self._handle(message, now, older):
+                    return True
+            except MalformedMessage as error:
+                self._reject(str(error), now)
+            except Exception as error:  # noqa: BLE001 - else no later message would be received
+                self._reject(repr(error), now)
             if time.monotonic_ns() > now + _MAX_WORK_NS:
                 return False
         return False

@@ -151,8 +151,15 @@ def encode_command(command: MotorCommand) -> bytes:
 
 def _checked(values: Array, most: float, name: str, minimum: float = -np.inf) -> list[float]:
     array = np.asarray(values, np.float64)
-    if array.shape != (NUM_JOINTS,) or not ((np.abs(array) <= most) & (array >= minimum)).all():
-        raise MalformedMessage(f"{name} of a command is not {NUM_JOINTS} numbers within bounds")
+    if array.shape != (NUM_JOINTS,):
+        raise MalformedMessage(f"{name} has shape {array.shape}, expected ({NUM_JOINTS},)")
+    wrong = ~((np.abs(array) <= most) & (array >= minimum))  # true for NaN too
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise MalformedMessage(
+            f"{name} of {JOINT_NAMES[i]} is {array[i]:g}, expected {max(minimum, -most):g} to "
+            f"{most:g}"
+        )
     numbers: list[float] = array.tolist()
     return numbers
 

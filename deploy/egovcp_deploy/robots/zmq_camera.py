@@ -114,7 +114,9 @@ class ZmqDepthCamera:
         """Wait up to ``timeout`` s for the first image; returns itself. Raises `EnvironmentFailure`
         if none arrived, or one of another field of view."""
         config = self.config
-        self._subscriber = Subscriber(config.host, config.port, FRAME_BYTES, self._handle)
+        self._subscriber = Subscriber(
+            config.host, config.port, FRAME_BYTES, self._handle, self._reject
+        )
         deadline = time.monotonic() + timeout
         while self._newest is None and time.monotonic() < deadline:
             time.sleep(0.005)
@@ -124,24 +126,18 @@ class ZmqDepthCamera:
             raise EnvironmentFailure(reason)
         return self
 
-    def _handle(self, message: bytes, time_ns: int) -> bool:
-        """Process a message that arrived at ``time_ns``; whether it is a new image."""
-        try:
-            frame = decode_frame(message)
-            if abs(frame.vertical_fov - self.config.vertical_fov) > _FOV_TOLERANCE:
-                raise MalformedMessage(
-                    f"a vertical field of view of {math.degrees(frame.vertical_fov):.1f} deg, "
-                    f"expected {math.degrees(self.config.vertical_fov):.1f}"
-                )
-        except MalformedMessage as error:
-            self._malformed += 1
-            self._problem = str(error)
-            self.arrivals.record_loss(time_ns)
-            return False
+    def _handle(self, message: bytes, time_ns: int, older: int) -> bool:
+        """Process a message that arrived at ``time_ns`` with ``older`` ones, which are not used;
+        whether it is a new image. Raises `MalformedMessage`."""
+        frame = decode_frame(message)
+        if abs(frame.vertical_fov - self.config.vertical_fov) > _FOV_TOLERANCE:
+            raise MalformedMessage(
+                f"a vertical field of view of {math.degrees(frame.vertical_fov):.1f} deg, "
+                f"expected {math.degrees(self.config.vertical_fov):.1f}"
+            )
         if frame.sequence == self._sequence:
             return False
         if self._sequence is not None:
-            older = self._subscriber.older if self._subscriber else 0  # arrived, but not used
             missing = (frame.sequence - self._sequence) % SEQUENCES - 1 - older
             if 0 < missing < _MAX_MISSING:
                 self.arrivals.record_loss(time_ns, missing)
@@ -151,6 +147,11 @@ class ZmqDepthCamera:
         self._newest = DepthImage(time_ns, frame.depth, captured_ns)
         self.arrivals.record_arrival(time_ns)
         return True
+
+    def _reject(self, problem: str, time_ns: int) -> None:
+        self._malformed += 1
+        self._problem = problem
+        self.arrivals.record_loss(time_ns)
 
     def read(self) -> DepthImage | None:
         """Return the newest image; its time is its time of arrival."""

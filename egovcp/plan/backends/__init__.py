@@ -40,7 +40,7 @@ def make_evaluator(model: WorldModel, config: PlannerConfig) -> PlanEvaluator[Ca
         return Int8Evaluator(model, config)
     if backend == "auto" and model.state_mean.device.type == "cpu" and library.processor_is_fast():
         try:
-            if library.library_if_possible() is not None:
+            if library.load_kernel_if_possible() is not None:
                 return Int8Evaluator(model, config)
         except UsageError as error:
             library.warn_float32(str(error))
@@ -52,6 +52,8 @@ class FloatEvaluator:
 
     Later changes of the model's weights are not seen.
     """
+
+    backend = "float32"
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._model, self._config = model, config
@@ -84,6 +86,8 @@ class Int8Evaluator:
         EnvironmentFailure: the kernel cannot be built.
         UsageError: the model is not on the CPU, or has sizes that the kernel does not take.
     """
+
+    backend = "int8"
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         device = model.state_mean.device

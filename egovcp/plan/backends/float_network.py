@@ -144,7 +144,7 @@ class PlanningNetwork:
         self._reward = None if model.reward_head is None else _Head(model.reward_head)
 
     def plan_value(self, prefix: SharedPrefix, actions: Tensor, noise: Tensor | None) -> Tensor:
-        """V (...) of plans (..., N, 7); noise (N - 1, latent) under ``latent=sample``."""
+        """V (...) of plans (..., P, 7); noise (P - 1, latent) under ``latent=sample``."""
         each = actions.unbind(-2)
         accumulator = ReturnAccumulator(self._config, self._model, len(each))
         if accumulator.needs_value(0):

@@ -32,15 +32,17 @@ MAX_ROWS: Final = 16
 MAX_STACK_BYTES: Final = 1 << 20
 """Limit of the actions and values of a block, which are on the stack."""
 LEVELS: Final = 127
+"""Largest integer of a weight."""
 OBJECTIVES: Final = ("value", "reward", "td")
 RULES: Final = ("paper", "shift", "survival")
 """In the order of the kernel's enumerations."""
 NODES: Final = 64
-UNIT: Final = 2048
+"""Nodes of the table of an activation."""
+HIDDEN_ONE: Final = 2048
 """Fixed-point 1 of hidden layers; 16 bits hold values up to 16."""
-ONE: Final = 32768
+STATE_ONE: Final = 32768
 """Fixed-point 1 of h, tanh and gates."""
-LEAST_SILU: Final = -571 / UNIT
+LEAST_SILU: Final = -571 / HIDDEN_ONE
 """Offset of the bytes of hidden layers, below the minimum of SiLU, -0.27846."""
 
 
@@ -60,28 +62,29 @@ class IntegerNetwork:
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
-        self._kernel = kernel = library.library()
-        self._packed = _Packed(model, config, library.layout(kernel))
-        self._start = start = self._packed.start
-        value_at, mix_at = start.gates, start.gates + start.heads
+        self._kernel = kernel = library.load_kernel()
+        self._packed = _Packed(model, config, library.weight_layout(kernel))
+        self._prefix_weights = weights = self._packed.prefix_weights
+        value_at, mix_at = weights.gates, weights.gates + weights.heads
         self._offsets = (mix_at, 0, value_at, value_at + model.config.units)
-        self._sum_count = mix_at + start.mix
+        self._sum_count = mix_at + weights.mix
         self._threads = library.Threads(kernel, torch.get_num_threads())
 
     def shared_prefix(self, carry: Carry) -> KernelPrefix:
         """The shared prefix of one robot at its state (1, ...)."""
         h, z = carry.h.contiguous(), carry.z.contiguous()
-        words = torch.zeros(self._start.hidden + LANES, dtype=torch.int16)
+        words = torch.zeros(self._prefix_weights.hidden + LANES, dtype=torch.int16)
         sums = torch.zeros(self._sum_count)
         address = sums.data_ptr()
-        nan = self._kernel.start(
-            ctypes.byref(self._start), h.data_ptr(), z.data_ptr(), words.data_ptr(), address
+        weights = ctypes.byref(self._prefix_weights)
+        nan = self._kernel.shared_prefix(
+            weights, h.data_ptr(), z.data_ptr(), words.data_ptr(), address
         )
         addresses = (address + 4 * offset for offset in self._offsets)  # mix, gates, value, reward
         return KernelPrefix(library.CSharedPrefix(words.data_ptr(), *addresses, nan), (words, sums))
 
     def plan_value(self, prefix: KernelPrefix, actions: Tensor, noise: Tensor | None) -> Tensor:
-        """V (M,) of plans (M, N, 7)."""
+        """V (M,) of plans (M, P, 7)."""
         plans, steps, _ = actions.shape
         values = torch.empty(plans)
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
@@ -104,7 +107,9 @@ class IntegerNetwork:
 class _Packed:
     """A network as the kernel's structures, and the tensors that they point into."""
 
-    def __init__(self, model: WorldModel, config: PlannerConfig, layout: library.Layout) -> None:
+    def __init__(
+        self, model: WorldModel, config: PlannerConfig, layout: library.WeightLayout
+    ) -> None:
         self._tensors: list[Tensor] = []
         self._layout = layout
         c = model.config
@@ -140,7 +145,7 @@ class _Packed:
             config.termination_threshold,
             float(model.discount),
         )
-        self.start = self._shared(model)
+        self.prefix_weights = self._shared(model)
         n.value = self._head(model.value_head)
         if model.reward_head is not None:
             n.reward = self._head(model.reward_head)
@@ -152,15 +157,16 @@ class _Packed:
             return 0, None
         return len(values), self._address(F.pad(values, (0, -len(values) % LANES)))
 
-    def _shared(self, model: WorldModel) -> library.CStart:
+    def _shared(self, model: WorldModel) -> library.CPrefixWeights:
         """The weights of the shared prefix, centred like those of their layers."""
         heads = [head for head in (model.value_head, model.reward_head) if head is not None]
-        of_h = [gru_layer(model.gru).wide_h, *(weight_of(head.first.parts[0]) for head in heads)]
-        of_z = [*(weight_of(head.first.parts[1]) for head in heads), weight_of(model.mix.parts[0])]
-        h, z = (torch.cat([_centred_columns(w) for w in parts]) for parts in (of_h, of_z))
-        gates, mix = len(of_h[0]), len(of_z[-1])
-        sizes = (model.config.hidden, model.config.latent, gates, len(h) - gates, mix)
-        return library.CStart(*sizes, self._address(h.t()), self._address(z.t()))
+        gates, mix = gru_layer(model.gru).wide_h, weight_of(model.mix.parts[0])
+        h_parts = [gates, *(weight_of(head.first.parts[0]) for head in heads)]
+        z_parts = [*(weight_of(head.first.parts[1]) for head in heads), mix]
+        h, z = (torch.cat([_centred_columns(w) for w in parts]) for parts in (h_parts, z_parts))
+        heads_size = len(h) - len(gates)
+        sizes = (model.config.hidden, model.config.latent, len(gates), heads_size, len(mix))
+        return library.CPrefixWeights(*sizes, self._address(h.t()), self._address(z.t()))
 
     def _address(self, tensor: Tensor, dtype: torch.dtype = torch.float32) -> int:
         """Address of a copy, which lives as long as this object."""
@@ -177,9 +183,9 @@ class _Packed:
         packed.first = self._layer(first, wide=h, second=z, narrow=action)
         packed.second = self._layer(second, wide=between.weight, wide_is_state=False)
         if len(top.bias) == 1:
-            packed.one = self._dot(top)
+            packed.scalar_top = self._dot(top)
         else:
-            packed.many = self._top(top)
+            packed.vector_top = self._top(top)
         return packed
 
     def _one_hidden(self, mlp: SplitMlp) -> tuple[library.CLayer, nn.Linear]:
@@ -202,19 +208,21 @@ class _Packed:
 
         The weights are scaled so that no lane of the sum exceeds 2^31.
         """
-        weight = top.weight.detach()[0] / UNIT
+        weight = top.weight.detach()[0] / HIDDEN_ONE
         inputs = len(weight)
         weight = F.pad(weight, (0, -inputs % WORDS))
         largest = weight.view(-1, self._layout.lanes, 2).abs().sum((0, 2)).amax()
-        least = weight.abs().amax() / (ONE - 1)
-        scale = float(torch.maximum(largest / (2 * ONE - 2 * MAX_WIDE), least).clamp_min(1e-30))
+        least = weight.abs().amax() / (STATE_ONE - 1)
+        scale = float(
+            torch.maximum(largest / (2 * STATE_ONE - 2 * MAX_WIDE), least).clamp_min(1e-30)
+        )
         whole = self._address((weight / scale).round(), torch.int16)
         return library.CDot(inputs, whole, scale, float(top.bias.detach()[0]))
 
     def _gru(self, model: WorldModel) -> library.CLayer:
         gru = gru_layer(model.gru)
-        half = ONE / 4 / 2  # the input range of tanh is 4; gates are tanh of half their sums
-        unit = torch.tensor([half, UNIT, half]).repeat_interleave(model.config.hidden)
+        half = STATE_ONE / 4 / 2  # the input range of tanh is 4; gates are tanh of half their sums
+        unit = torch.tensor([half, HIDDEN_ONE, half]).repeat_interleave(model.config.hidden)
         layer = self._normalised(unit * gru.gamma, unit * gru.beta, gru.epsilon)
         layer.wide = self._wide(_centred_columns(gru.wide_x), state=False)
         layer.second = self._wide(_centred_columns(gru.wide_h), state=True)
@@ -228,7 +236,7 @@ class _Packed:
         narrow: Tensor | None = None,
         wide_is_state: bool = True,
     ) -> library.CLayer:
-        layer = self._normalised(UNIT * norm.weight, UNIT * norm.bias, norm.eps)
+        layer = self._normalised(HIDDEN_ONE * norm.weight, HIDDEN_ONE * norm.bias, norm.eps)
         if wide is not None:
             layer.wide = self._wide(_centred_columns(wide), wide_is_state)
         if second is not None:
@@ -256,8 +264,7 @@ class _Packed:
         zero, offset = (128, 0.0) if state else (0, LEAST_SILU)
         weight = F.pad(weight.detach().float(), (0, -weight.shape[1] % self._layout.depth))
         outputs, inputs = weight.shape
-        if inputs > MAX_WIDE:
-            raise UsageError(f"a layer of {inputs} inputs; {library.FLOAT32_HINT}")
+        assert inputs <= MAX_WIDE, "its inputs are the outputs of other layers"
         scale = weight.abs().amax(1).clamp_min(1e-12) / LEVELS
         whole = (weight / scale[:, None]).round()
         total = whole.sum(1)
@@ -278,13 +285,14 @@ def _centred_columns(weight: Tensor) -> Tensor:
 
 
 def silu_table() -> Tensor:
-    """(2, 64) of SiLU(-a), a up to 8, in UNIT: values at nodes, and half the rise of a piece."""
-    return _lines(lambda a: -a * torch.sigmoid(-a), 8.0 / NODES, UNIT)
+    """(2, 64) of SiLU(-a), a up to 8, unit `HIDDEN_ONE`: values at nodes, and half the rise of a
+    piece."""
+    return _lines(lambda a: -a * torch.sigmoid(-a), 8.0 / NODES, HIDDEN_ONE)
 
 
 def tanh_table() -> Tensor:
-    """(2, 64) of tanh(a), a up to 4, in ONE."""
-    table = _lines(torch.tanh, 4.0 / NODES, ONE)
+    """(2, 64) of tanh(a), a up to 4, unit `STATE_ONE`."""
+    table = _lines(torch.tanh, 4.0 / NODES, STATE_ONE)
     table[0, 0] = 0  # odd
     return table
 
@@ -301,4 +309,6 @@ def _lines(function: Callable[[Tensor], Tensor], spacing: float, unit: int) -> T
     value = (function(node) + (left + right) / 2) / 2
     rise = (right - left) / 2
     rise[-1] = 0.0
-    return (unit * torch.stack([value, rise])).round().clamp(-ONE, ONE - 1).to(torch.int16)
+    return (
+        (unit * torch.stack([value, rise])).round().clamp(-STATE_ONE, STATE_ONE - 1).to(torch.int16)
+    )

@@ -75,7 +75,7 @@ class CTop(ctypes.Structure):
 
 
 class CHead(ctypes.Structure):
-    _fields_ = (*_fields(CLayer, "first second"), ("one", CDot), ("many", CTop))
+    _fields_ = (*_fields(CLayer, "first second"), ("scalar_top", CDot), ("vector_top", CTop))
 
 
 class CReadout(ctypes.Structure):
@@ -103,8 +103,8 @@ class CSharedPrefix(ctypes.Structure):
     _fields_ = (*_fields(_P, "h mix gates value reward"), ("nan_or_zero", _F))
 
 
-class CStart(ctypes.Structure):
-    _fields_ = (*_fields(_I, "hidden latent gates heads mix"), *_fields(_P, "of_h of_z"))
+class CPrefixWeights(ctypes.Structure):
+    _fields_ = (*_fields(_I, "hidden latent gates heads mix"), *_fields(_P, "h_weights z_weights"))
 
 
 class CThreadPool(ctypes.Structure):
@@ -173,7 +173,7 @@ def compiler() -> str | None:
 
 
 @cache
-def library() -> ctypes.CDLL:
+def load_kernel() -> ctypes.CDLL:
     """The kernel, from the user's cache folder; compiled in about 2 s if it is not there.
 
     Raises:
@@ -199,16 +199,16 @@ def library() -> ctypes.CDLL:
         ("draw", None, _I, _I, _I, _P, _P, _P, _P),
         ("walk", None, _I, _I, _I, _I, _F, _P, _P, _P),
         ("update", None, _I, _I, _I, _I, _F, _P, _P, _P, _P, _P, _P, _P),
-        ("start", _F, _P, _P, _P, _P, _P),
+        ("shared_prefix", _F, _P, _P, _P, _P, _P),
         ("missing_workers", _I, _P, _I),
-        ("layout", None, _P, _P, _P),
+        ("weight_layout", None, _P, _P, _P),
     ):
         function = getattr(kernel, symbol)
         function.restype, function.argtypes = result, arguments
     return kernel
 
 
-class Layout(NamedTuple):
+class WeightLayout(NamedTuple):
     """Memory layout of the weights of wide products for this processor."""
 
     depth: int  # inputs are padded with zeros to a multiple of it
@@ -216,11 +216,11 @@ class Layout(NamedTuple):
     group: int  # adjacent inputs
 
 
-def layout(kernel: ctypes.CDLL) -> Layout:
+def weight_layout(kernel: ctypes.CDLL) -> WeightLayout:
     """The layout of a kernel."""
-    found = [ctypes.c_int32() for _ in Layout._fields]
-    kernel.layout(*map(ctypes.byref, found))
-    return Layout(*(x.value for x in found))
+    found = [ctypes.c_int32() for _ in WeightLayout._fields]
+    kernel.weight_layout(*map(ctypes.byref, found))
+    return WeightLayout(*(x.value for x in found))
 
 
 def request_amx_tiles() -> bool:
@@ -233,10 +233,10 @@ def request_amx_tiles() -> bool:
 
 
 @cache
-def library_if_possible() -> ctypes.CDLL | None:
-    """`library`; None where it cannot be used, which is reported on stderr once."""
+def load_kernel_if_possible() -> ctypes.CDLL | None:
+    """`load_kernel`; None where it cannot be used, which is reported on stderr once."""
     try:
-        return library()
+        return load_kernel()
     except EnvironmentFailure as error:
         warn_float32(str(error))
         return None
@@ -245,7 +245,7 @@ def library_if_possible() -> ctypes.CDLL | None:
 @cache
 def warn_float32(reason: str) -> None:
     """Warn once, on stderr, that ``--planner.backend=auto`` computes in float32."""
-    _warn(f"{reason}. Planning in float32, which is slower")
+    _warn(f"{reason.removesuffix(f'; {FLOAT32_HINT}')}. Planning in float32, which is slower")
 
 
 def _warn(text: str) -> None:

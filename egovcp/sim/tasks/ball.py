@@ -29,7 +29,7 @@ BALL: Final = "ball"
 _PARKED: Final = np.array([-20.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # behind the robot, unseen
 _AT_REST: Final = np.zeros(6)
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
-_HALF_EDGE: Final = (math.pi / 6) ** (1 / 3)  # of a cube, in radii of the ball of its volume
+_HALF_EDGE: Final = (math.pi / 6) ** (1 / 3)  # of a cube with the volume of a ball of radius 1
 _TUMBLE: Final = 6.0  # rad/s, the most that a box turns about each axis
 # The oracle.
 _LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
@@ -122,7 +122,7 @@ class BallTask(Task):
 
     @property
     def _half_sizes(self) -> tuple[float, float, float]:
-        """Half edges of a box, or the radius three times, m."""
+        """Half extents along its own axes, m."""
         half = self.radius * _HALF_EDGE if self._is_box else self.radius
         return (half, half, half)
 

@@ -33,7 +33,8 @@ class BaseTask(ABC):
     terms: ClassVar[Mapping[str, str]]
     """Reward term -> the column of ``spec.REWARD_TERMS`` in which datasets store it: ``block`` (a
     wanted contact), ``pass`` (another achievement) or ``hit`` (an unwanted contact or state).
-    ``fall`` and ``spec.ACTION_TERMS`` are terms of every task."""
+    A name consists of lower-case letters, digits and ``_``; ``fall`` and ``spec.ACTION_TERMS`` are
+    terms of every task."""
     config: Any = TaskConfig()
     """Options of the task, ``--env.<name>.*``: a frozen dataclass derived from `TaskConfig`. The
     value of the class holds the defaults, that of an instance the options of the environment."""
@@ -52,8 +53,8 @@ class BaseTask(ABC):
     for_training: ClassVar[bool] = True
     """Whether datasets of the task can be collected; ``--task=all`` has all these tasks."""
     seed_key: ClassVar[int | None] = None
-    """Key of the task's random streams; None: derived from `name`. Only for egovcp's own tasks,
-    which had these keys before."""
+    """Key of the task's random streams; None: derived from `name`. Fixed for egovcp's own tasks,
+    whose scenarios do not depend on their names."""
 
     @classmethod
     @abstractmethod

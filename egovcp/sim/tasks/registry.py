@@ -34,6 +34,8 @@ ALL_TASKS: Final = "all"
 DEFAULT_TASK: Final = "ball"
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]*")
+#: What recordings hold beside the reward terms.
+_RECORDED: Final = ("reward", "success", "terminated", "truncated")
 _COLUMNS: Final = tuple(name for name in REWARD_TERMS if name not in (*ACTION_TERMS, "fall"))
 
 
@@ -122,6 +124,11 @@ def _check(task: type[BaseTask]) -> None:
     if problem := name_problem(task.name):
         raise ValueError(problem)
     for term, column in task.terms.items():
+        if not _NAME.fullmatch(term) or term in _RECORDED:
+            raise ValueError(
+                f"{term!r} cannot be the name of a reward term: use lower-case letters, digits and "
+                f"_, and none of {', '.join(_RECORDED)}"
+            )
         if column not in _COLUMNS:
             raise ValueError(
                 f"terms[{term!r}] is {column!r}, expected one of {', '.join(_COLUMNS)}"
@@ -155,14 +162,15 @@ def name_problem(name: str) -> str:
     """Why a task cannot have this name; empty: it can."""
     from egovcp.sim.config import BaseEnvConfig
 
-    reserved = [*(option.name for option in dataclasses.fields(BaseEnvConfig)), ALL_TASKS]
-    wrong = not _NAME.fullmatch(name) or keyword.iskeyword(name)
-    if not wrong and name not in reserved and not name.endswith("_episode"):
-        return ""
-    return (
-        f"{name!r} cannot be the name of a task: use lower-case letters, digits and _, and no "
-        f"Python keyword, NAME_episode, {', '.join(reserved)}"
-    )
+    rules = {
+        "use lower-case letters, digits and _, a letter first": _NAME.fullmatch(name) is None,
+        "it is a Python keyword": keyword.iskeyword(name),
+        "--task=all selects all tasks": name == ALL_TASKS,
+        "names of options end in _episode": name.endswith("_episode"),
+        "it is an option of --env": name in [o.name for o in dataclasses.fields(BaseEnvConfig)],
+    }
+    broken = [rule for rule, is_broken in rules.items() if is_broken]
+    return f"{name!r} cannot be the name of a task: {broken[0]}" if broken else ""
 
 
 def register_task(reference: str) -> str:
@@ -240,6 +248,11 @@ def find_task(name: str, option: str = "") -> type[BaseTask]:
             raise EnvironmentFailure(entry.failure)
     require_packages("egovcp", f"the task {name!r}", *SIMULATOR_MODULES)
     where = f"{option}: " if option else ""
+    if ":" in name:
+        raise UsageError(
+            f"{where}task {name} is not registered: give it by the flag --task={name}, not in a "
+            "file, or call egovcp.sim.tasks.register_task"
+        )
     known = suggest(name, task_names()) if entries else "; install egovcp again: it has no tasks"
     raise UsageError(
         f"{where}unknown task {name!r}{known}; a task of another package needs that package "

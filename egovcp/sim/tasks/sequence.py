@@ -1,4 +1,4 @@
-"""Several tasks in one episode: an arch to duck under, then something thrown (figure 4a).
+"""Several tasks in one episode, by default arch, ball and wall (figure 4a of the paper).
 
 The parameters of a part are those of its task's scenario with the same seed and episode. A part
 lasts until a pause after it has finished, at most as long as its task's episodes. Then its object

@@ -41,14 +41,14 @@ class WallConfig(TaskConfig):
     friction_range: Range = bounded((0.6, 1.0), least=0, most=5)
     """Sliding friction of the wall."""
     push_speed_range: Range = bounded((0.70, 1.00), least=0, most=5)
-    """Change of base velocity by a push towards the wall, m/s; calibrated for the controller walk
-    (benchmarks/tasks.py)."""
+    """Change of base velocity by a push towards the wall, m/s."""
     push_bearing_range: Range = bounded((-0.20, 0.20), least=-math.pi, most=math.pi)
     """Direction of a push towards the wall, rad from straight ahead."""
     away_probability: float = bounded(0.1, least=0, most=1)
     """Share of the pushes that go away from the wall."""
     away_speed_range: Range = bounded((0.05, 0.15), least=0, most=5)
-    """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
+    """Change of base velocity by a push away from the wall, m/s; a robot that holds its pose
+    stays up."""
     push_time: float = bounded(0.02, least=0.005, most=1)
     """Time over which a push acts, s."""
     disturbed_time: float = bounded(1.0, least=0, most=3600)

@@ -82,7 +82,7 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
         "one model on mixed data against one per task; t-SNE of h and z (fig. 6)", multitask.report
     ),
     "planners": Experiment(
-        "CEM, iCEM, MPPI and random shooting in equal time; termination rules",
+        "CEM, iCEM, MPPI and random shooting in equal time; single options of the planner",
         planners.report,
         has_variants=True,
     ),

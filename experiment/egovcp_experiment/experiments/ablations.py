@@ -61,13 +61,14 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     }
     page = ExperimentReport(
         "Ablations: effect of each design choice on held-out metrics",
+        note="",  # plays no scenarios
         sections=[
             f"Every model was trained for {config.train.steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
-            "(x): times below the error of repeating the last image, at that many ticks "
-            "open-loop. Columns of Q compare it with each model's own target: the critic, but "
-            "returns for `mc`, `monte_carlo`, `td` and `paper` (whose returns differ, too). So "
-            "they are not comparable between these groups."
+            "(x): how many times smaller the error is than that of repeating the last image, at "
+            "that many ticks open-loop. Columns of Q compare it with each model's own target: the "
+            "critic, but returns for `mc`, `monte_carlo`, `td` and `paper` (whose returns differ, "
+            "too). So they are not comparable between these groups."
         ],
     )
     found: dict[str, Rows] = {}
@@ -79,10 +80,12 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         }
         page.lead += _best(task, rows, "moving, 8 (x)")
         page.findings += _best(task, rows, "all pixels, 8 (x)")
+        if not rows and any(cell in records for cells in trainings.values() for cell in cells):
+            page.findings.append(f"{task}: no episode is held out, because its data has too few.")
         page.sections.append(_table(task, rows))
-        page.figures[task] = rows
+        page.metrics[task] = rows
         found[task] = rows
-    page.figure = _plot(found, "moving, 8 (x)")
+    page.plot = _plot(found, "moving, 8 (x)")
     return page
 
 
@@ -119,7 +122,7 @@ def _plot(found: Mapping[str, Rows], column: str) -> Plot | None:
         axes.set_xlabel(column)
         axes.legend(fontsize=8)
 
-    caption = f"{column}: times below the error of repeating the last image"
+    caption = f"{column}: how many times smaller the error is than that of repeating the last image"
     return draw("choices", caption, paint, (8.0, 0.9 + 0.25 * len(names)))
 
 

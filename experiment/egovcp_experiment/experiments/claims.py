@@ -68,8 +68,8 @@ class Verdict:
         half = quantile * float(np.std(self.differences, ddof=1)) / sqrt(n)
         return float(np.mean(self.differences)), half
 
-    def figures(self) -> dict[str, Any]:
-        """For programs."""
+    def metrics(self) -> dict[str, Any]:
+        """The verdict as JSON values."""
         return {
             "above": self.claim.above,
             "below": self.claim.below,

@@ -117,7 +117,7 @@ _SEQUENCES: Final[dict[str, Flags]] = {
 }
 
 
-type Scores = dict[str, EvalScores]
+type ConditionScores = dict[str, EvalScores]
 """Condition or controller -> scores."""
 
 
@@ -170,10 +170,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             "played by the same model, whose input names neither tasks nor times. Each part draws "
             "what its task draws alone; parts after a fall are failures."
         )
-    found: dict[str, Scores] = {}
+    found: dict[str, ConditionScores] = {}
     for task, row in chosen.items():
-        planner: Scores = {}
-        references: dict[str, Scores] = {}
+        planner: ConditionScores = {}
+        references: dict[str, ConditionScores] = {}
         for name, flags in row.items():
             plays = grid.plays(task, f"in_{name}" if flags else DEFAULT, flags)
             scores = results.eval_scores(records, plays, task)
@@ -186,8 +186,8 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             for title, names in _groups(task, planner).items():
                 part = {name: planner[name] for name in names}
                 page.sections.append(_table(f"{task}: {title}", part, references, row))
-        page.figures[task] = {
-            name: results.figures_of({"planner": scores, **references[name]})
+        page.metrics[task] = {
+            name: results.metrics_of({"planner": scores, **references[name]})
             for name, scores in planner.items()
         }
     verdicts = {
@@ -198,7 +198,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     page.lead = _lead(found, verdicts)
     page.findings = _conclusions(found, verdicts)
     if tasks := {task: planner for task, planner in found.items() if task in config.tasks}:
-        page.figure = _plot(tasks)
+        page.plot = _plot(tasks)
     return page
 
 
@@ -219,7 +219,7 @@ def _same_episodes(flags: Flags, other: Flags) -> bool:
     return all(flags.get(name) == other.get(name) for name in timing)
 
 
-def _verdict(scores: EvalScores, planner: Scores) -> str:
+def _verdict(scores: EvalScores, planner: ConditionScores) -> str:
     """One of `_WORDS`; empty for the first condition, and for episodes of other parts."""
     base = next(iter(planner.values()))
     if scores is base or len(scores.parts) != len(base.parts):
@@ -229,7 +229,10 @@ def _verdict(scores: EvalScores, planner: Scores) -> str:
 
 
 def _table(
-    title: str, planner: Scores, references: Mapping[str, Scores], flags: Mapping[str, Flags]
+    title: str,
+    planner: ConditionScores,
+    references: Mapping[str, ConditionScores],
+    flags: Mapping[str, Flags],
 ) -> Table:
     """The comparison with the first condition, rates of parts and references, and the scenes."""
     table = results.comparison(title, planner, next(iter(planner)))
@@ -249,7 +252,9 @@ def _table(
     return Table(title, (*table.head, *head), rows)
 
 
-def _lead(found: Mapping[str, Scores], verdicts: Mapping[tuple[str, str], str]) -> list[str]:
+def _lead(
+    found: Mapping[str, ConditionScores], verdicts: Mapping[tuple[str, str], str]
+) -> list[str]:
     edges = {k: v for k, v in verdicts.items() if v and k[1] in _EDGES.get(k[0], ())}
     beyond = {k: v for k, v in verdicts.items() if v and k not in edges}
     lines = []
@@ -271,14 +276,16 @@ def _lead(found: Mapping[str, Scores], verdicts: Mapping[tuple[str, str], str]) 
     return lines
 
 
-def _points(found: Mapping[str, Scores], key: tuple[str, str]) -> float:
+def _points(found: Mapping[str, ConditionScores], key: tuple[str, str]) -> float:
     """Success above the first condition, points."""
     task, name = key
     first = next(iter(found[task].values()))
     return 100 * (found[task][name].success_rate - first.success_rate)
 
 
-def _conclusions(found: Mapping[str, Scores], verdicts: Mapping[tuple[str, str], str]) -> list[str]:
+def _conclusions(
+    found: Mapping[str, ConditionScores], verdicts: Mapping[tuple[str, str], str]
+) -> list[str]:
     lines = []
     for task, planner in found.items():
         base, first = next(iter(planner.items()))
@@ -294,7 +301,7 @@ def _conclusions(found: Mapping[str, Scores], verdicts: Mapping[tuple[str, str],
     return lines
 
 
-def _plot(found: Mapping[str, Scores]) -> Plot:
+def _plot(found: Mapping[str, ConditionScores]) -> Plot:
     """Success above the first condition, one panel per task."""
     panels: dict[str, dict[str, Difference]] = {}
     for task, planner in found.items():

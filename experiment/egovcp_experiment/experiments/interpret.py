@@ -11,7 +11,7 @@ from egovcp_experiment import results
 from egovcp_experiment.experiments.table1 import MODELS
 from egovcp_experiment.grid import DEFAULT, Grid, Model
 from egovcp_experiment.report import ExperimentReport, Plot, Table, draw, number, percent
-from egovcp_experiment.studies.behaviour import NEAR_NEUTRAL_M
+from egovcp_experiment.studies.behaviour import NEAR_START_M
 from egovcp_experiment.studies.open_loop import HORIZONS
 
 #: Of `table1`.
@@ -21,7 +21,8 @@ _ARWM: Final = Model("arwm", MODELS["arwm"])
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     page = ExperimentReport(
-        "Interpretation: values, open-loop predictions, and behaviour with and without events"
+        "Interpretation: values, open-loop predictions, and behaviour with and without events",
+        note="Intervals are 95 %, over scenarios.",
     )
     studies = {
         "value_maps": _add_value_maps,
@@ -39,9 +40,9 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             place = task if model.name == DEFAULT else f"{task}-{model.name}"
             cell = grid.sim_study(name, place, flags, model)
             if cell in records:
-                found = found_by_title[title] = records[cell]["figures"]
+                found = found_by_title[title] = records[cell]["metrics"]
                 drawn_only = ("maps", "strips", "x", "z")
-                page.figures[cell] = {k: v for k, v in found.items() if k not in drawn_only}
+                page.metrics[cell] = {k: v for k, v in found.items() if k not in drawn_only}
         if found_by_title:
             add(page, found_by_title)
     return page
@@ -68,7 +69,7 @@ def _add_value_maps(page: ExperimentReport, found_by_title: Results) -> None:
         Table("Value map of the hand on the ball's side, means over episodes", head, rows),
     ]
     if found["maps"]:
-        page.figure = _map_plot(found)
+        page.plot = _map_plot(found)
     if {"before", "75%"} <= summary.keys():
         before, late = (summary[name]["height_error_m"] for name in ("before", "75%"))
         page.lead.append(
@@ -127,20 +128,20 @@ def _add_open_loop(page: ExperimentReport, found_by_title: Results) -> None:
         errors = found["errors_m"]
         head = (
             *("ticks ahead", "model (cm)", "repeat (cm)"),
-            *("moving: model (cm)", "moving: repeat (cm)"),
+            *("changed: model (cm)", "changed: repeat (cm)"),
         )
         title = (
             f"{task}: open-loop depth under the actions that were sent, {found['episodes']} "
-            "episodes, all valid pixels; moving: those where repeating the last image is wrong by "
+            "episodes, all valid pixels; changed: those where repeating the last image is wrong by "
             "more than 20 cm, so that there it loses by construction"
         )
-        columns = ("model", "repeat", "model_moving", "repeat_moving")
+        columns = ("model", "repeat", "model_changed", "repeat_changed")
         rows = [(k, *(_centimetres(row[c]) for c in columns)) for k, row in errors.items()]
         page.sections.append(Table(title, head, rows))
         if found["strips"]:
             plot = _strip_plot(task, found["strips"])
-            if page.figure is None:
-                page.figure = plot
+            if page.plot is None:
+                page.plot = plot
             else:
                 page.sections.append(plot)
         if errors[last]["model"] is not None:
@@ -186,7 +187,7 @@ _BEHAVIOUR: Final = {
     "bracing_q": ("Q of the oracle's bracing pose above the neutral pose (sd of the return)", 1),
     "bracing_j": ("the same minus the costs of holding them (sd of the return)", 1),
     "hands_back": (
-        "both hands within 10 cm of neutral at most 2 s after recovering from a push (%)",
+        "both hands within 10 cm of their start at some time in the 2 s after a recovery (%)",
         100,
     ),
     "pelvis_far": ("pelvis while no arch is near (cm)", 100),
@@ -239,7 +240,7 @@ def _ball(found: Mapping[str, Any]) -> str:
     empty, after = found["empty_scene"], found["after_throw"]
     if after["mean"] is None:
         return ""
-    if empty["ci95"][0] > NEAR_NEUTRAL_M:
+    if empty["ci95"][0] > NEAR_START_M:
         word = "raised in empty scenes, too"
     elif after["ci95"][0] > empty["ci95"][1]:
         word = "raised for the ball"

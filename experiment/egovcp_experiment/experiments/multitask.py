@@ -49,22 +49,22 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         scores = results.all_scores(records, plays, task)
         cell = grid.references(task, f"references-{task}", controllers=_REFERENCES)
         references = results.controller_scores(records, cell, task, _REFERENCES)
-        page.figures[task] = results.figures_of({**scores, **references})
+        page.metrics[task] = results.metrics_of({**scores, **references})
         if scores:
             page.sections.append(results.comparison(task, {**scores, **references}, "single"))
         if len(scores) == 2:
             both[task] = scores
         if {"oracle", "random"} <= references.keys():
             levels[task] = {name: _level(each, references) for name, each in scores.items()}
-            page.figures[task]["normalised"] = levels[task]
+            page.metrics[task]["normalised"] = levels[task]
     if levels:
-        page.figure = _levels_plot(levels)
+        page.plot = _levels_plot(levels)
     page.lead = _lead(both)
     episodes = min(config.play.episodes, _LATENT_EPISODES)
     flags = {"tasks": list(config.tasks), "episodes": episodes}
     cell = grid.sim_study("latents", ALL, flags, mixed)
     if cell in records:
-        latents = records[cell]["figures"]
+        latents = records[cell]["metrics"]
         page.sections.append(_maps(latents))
         page.lead.append(_separation(latents))
         ticks = [number(latents[name]["tick_r2"], ".2f") for name in ("h", "z")]
@@ -72,7 +72,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             f"The nearest states explain {ticks[0]} (h) and {ticks[1]} (z) of the variance of time "
             "within a task."
         )
-        page.figures["latents"] = {
+        page.metrics["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }
     return page

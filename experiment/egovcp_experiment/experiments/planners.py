@@ -1,4 +1,4 @@
-"""Searches in equal time, and other planner choices, with one model and the same scenarios."""
+"""Searches in equal time, and single options of the planner, on the same scenarios."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any, Final
 
 from egovcp.eval_scores import EvalScores, Gain
 from egovcp_experiment import results
-from egovcp_experiment.cell import CellFigure, Flags
+from egovcp_experiment.cell import CellMetric, Flags
 from egovcp_experiment.gain_plot import Difference, gain_plot
 from egovcp_experiment.grid import Grid
 from egovcp_experiment.report import ExperimentReport, Table
 from egovcp_experiment.studies.plan_time import SEARCHES
 
-#: Rule -> flags of egovcp-eval; the search is the policy's own. ``default`` has
+#: Option -> flags of egovcp-eval; the search is the policy's own. ``default`` has
 #: termination_rule=shift, action_parameterization=target and mirror=true, unless it was trained
 #: with others.
-RULES: Final[dict[str, Flags]] = {
+OPTIONS: Final[dict[str, Flags]] = {
     "default": {},
     "rule_paper": {"planner.termination_rule": "paper"},
     "rule_survival": {"planner.termination_rule": "survival"},
@@ -27,45 +27,45 @@ RULES: Final[dict[str, Flags]] = {
 
 
 #: Kind of variants -> the one that the others are compared with.
-_REFERENCE: Final = {"searches": "cem", "rules": "default"}
+_REFERENCE: Final = {"searches": "cem", "options": "default"}
 
-type Scores = Mapping[str, EvalScores]
+type VariantScores = Mapping[str, EvalScores]
 """Variant -> scores."""
 
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
     page = ExperimentReport(
-        "Planners: searches in equal time, and rules after a failure",
+        "Planners: searches in equal time, and single options of the planner",
         sections=[
             "Searches: each has the largest number of candidates with a plan time below "
             f"{config.play.budget_ms:g} ms on the machine below; all searches were timed in turns. "
             "The number of elites is the planner's, at most half of the candidates. "
             "`cem_1` and `cem_6` are `cem` with 1 and 6 iterations instead of 3. "
-            "Rules: the policy's own search."
+            "Options: the policy's own search."
         ],
     )
-    chosen = config.chosen({**dict.fromkeys(SEARCHES), **dict.fromkeys(RULES)})
-    found: dict[str, dict[str, Scores]] = {kind: {} for kind in _REFERENCE}
+    chosen = config.chosen({**dict.fromkeys(SEARCHES), **dict.fromkeys(OPTIONS)})
+    found: dict[str, dict[str, VariantScores]] = {kind: {} for kind in _REFERENCE}
     for task in config.tasks:
         search_plays = _search_plays(grid, task, [name for name in SEARCHES if name in chosen])
-        rule_plays = {
-            name: grid.plays(task, name, flags) for name, flags in RULES.items() if name in chosen
+        option_plays = {
+            name: grid.plays(task, name, flags) for name, flags in OPTIONS.items() if name in chosen
         }
         searches = results.all_scores(records, search_plays, task)
-        rules = results.all_scores(records, rule_plays, task)
+        options = results.all_scores(records, option_plays, task)
         timing = records.get(f"plan_time-{task}")
         if timing is not None:
-            timed = timing["figures"]["searches"]
+            timed = timing["metrics"]["searches"]
             page.sections.append(_timings(task, timed, searches))
             page.findings += _over_budget(task, timed, searches, config.play.budget_ms)
-        for kind, scores in (("searches", searches), ("rules", rules)):
+        for kind, scores in (("searches", searches), ("options", options)):
             if scores:
                 title = f"{task}: {kind}"
                 page.sections.append(results.comparison(title, scores, _REFERENCE[kind]))
                 found[kind][task] = scores
         named = {f"search_{name}": each for name, each in searches.items()}
-        page.figures[task] = results.figures_of({**named, **rules})
+        page.metrics[task] = results.metrics_of({**named, **options})
     gains = {kind: _gains(kind, scores) for kind, scores in found.items()}
     if any(found["searches"].values()):
         best = ", ".join(
@@ -80,12 +80,12 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             shown = {n: Difference(g.reward, g.reward_interval, colour) for n, g in row.items()}
             panels.setdefault(task, {}).update(shown)
     if panels:
-        caption = "Reward per step above `cem` (searches, blue) and above `default` (rules, orange)"
-        page.figure = gain_plot("gains", caption, panels, "reward per step")
+        caption = "Reward per step above `cem` (searches, blue) or `default` (options, orange)"
+        page.plot = gain_plot("gains", caption, panels, "reward per step")
     return page
 
 
-def _gains(kind: str, found: Mapping[str, Scores]) -> dict[str, dict[str, Gain]]:
+def _gains(kind: str, found: Mapping[str, VariantScores]) -> dict[str, dict[str, Gain]]:
     """Task -> variant -> gain over the reference; without tasks that lack it."""
     reference = _REFERENCE[kind]
     return {
@@ -119,7 +119,7 @@ def _search_plays(grid: Grid, task: str, searches: Sequence[str]) -> dict[str, l
         budget = {"budget_ms": grid.config.play.budget_ms}
         timing = grid.study("plan_time", task, budget, exclusive=True)
         options = ("optimiser", "iterations", "samples", "elites")
-        flags = {f"planner.{o}": CellFigure(timing, ("searches", name, o)) for o in options}
+        flags = {f"planner.{o}": CellMetric(timing, ("searches", name, o)) for o in options}
         plays[name] = grid.plays(task, f"search_{name}", flags)
     return plays
 

@@ -58,8 +58,8 @@ def steps_per_episode(grid: Grid, task: str, records: results.Records) -> float:
         return transitions / episodes
     if data.cell not in records:
         return float(short_episodes().episode(task).ticks)
-    figures = records[data.cell]["figures"]
-    return float(figures["steps"] / figures["episodes"])
+    metrics = records[data.cell]["metrics"]
+    return float(metrics["steps"] / metrics["episodes"])
 
 
 def count_text(count: int) -> str:
@@ -95,10 +95,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
             last[task] = list(ppo.values())[-1]
             curves.append(results.Curve(f"{task}, PPO", ppo, f"C{k}", "x--"))
             page.findings += _conclusions(task, ppo, references)
-            page.figures[task] = {}
+            page.metrics[task] = {}
             if not grid.given_policy(grid.trained_on):  # else its transitions are unknown
                 offline = round(grid.episodes(task) * steps_per_episode(grid, task, records))
-                page.figures[task]["planner_transitions"] = offline
+                page.metrics[task]["planner_transitions"] = offline
                 if planner is not None:
                     curves.append(results.Curve(task, {offline: planner}, f"C{k}", "o"))
         ours = {} if planner is None else {_PLANNER: planner}
@@ -109,10 +109,10 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         }
         if shown:
             page.sections.append(results.comparison(task, shown, _PLANNER))
-            page.figures.setdefault(task, {}).update(results.figures_of(shown))
+            page.metrics.setdefault(task, {}).update(results.metrics_of(shown))
     if curves:
         caption = "PPO (dashed) and the planner (dots): success and reward against transitions"
-        page.figure = results.learning_curves("transitions", caption, {"transitions": curves})
+        page.plot = results.learning_curves("transitions", caption, {"transitions": curves})
     if planners:
         page.lead.append(f"The planner succeeds in {_rates(planners)}.")
     if last:

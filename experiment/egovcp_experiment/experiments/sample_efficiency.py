@@ -32,7 +32,8 @@ _DURING: Final = 3  # policies played before the end of a training, at most
 
 def report(grid: Grid, records: results.Records) -> ExperimentReport:
     config = grid.config
-    _require_parts(grid)
+    _require_parts(config)
+    grid.collected = max(1.0, *config.data.parts)
     page = ExperimentReport(
         "Scaling: success against transitions and gradient steps",
         sections=[_introduction(config)],
@@ -63,12 +64,12 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         if shown:
             shown |= results.controller_scores(records, references, task, REFERENCES)
             page.sections.append(results.comparison(task, shown, "".join(last)))
-            page.figures[task] = results.figures_of(shown)
+            page.metrics[task] = results.metrics_of(shown)
     panels = {"transitions": data + ppo_curves, "gradient steps": training}
     panels = {label: curves for label, curves in panels.items() if curves}
     if panels:
         caption = f"Success and reward against {listed(list(panels))}"
-        page.figure = results.learning_curves("scaling", caption, panels)
+        page.plot = results.learning_curves("scaling", caption, panels)
     page.lead = [
         *_lead(data, "data", "transitions"),
         *_lead(training, "gradient steps", "steps"),
@@ -77,13 +78,11 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
     return page
 
 
-def _require_parts(grid: Grid) -> None:
-    """Set the share of the episodes to collect; refuse more than all of a given dataset."""
-    config = grid.config
-    grid.collected = max(1.0, *config.data.parts)
+def _require_parts(config: ExperimentConfig) -> None:
+    """Refuse more than all of a given dataset."""
     given = sorted(set(config.data.roots) & set(config.tasks))
-    if grid.collected > 1 and given:
-        parts = [part for part in config.data.parts if part <= 1]
+    if max(config.data.parts) > 1 and given:
+        parts = [part for part in config.data.parts if part <= 1] or [1.0]
         raise UsageError(
             f"--data.parts={list(config.data.parts)}: parts of the dataset given for {given[0]} "
             f"(--data.roots) are at most 1; give --data.parts={parts}"

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-from egovcp.artifact import policy_folder, read_options
+from egovcp.artifact import read_options
 from egovcp.errors import UsageError
 from egovcp.eval_scores import EvalScores
-from egovcp.hub import is_local_path
 from egovcp_experiment import results
 from egovcp_experiment.cell import Flags
 from egovcp_experiment.config import ExperimentConfig
@@ -30,7 +30,7 @@ from egovcp_experiment.report import (
     percent,
 )
 
-type Scores = dict[str, dict[str, EvalScores]]
+type RowScores = dict[str, dict[str, EvalScores]]
 """Task -> row -> scores."""
 
 
@@ -159,7 +159,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         _lead(verdicts, scores),
         _forest(verdicts, references),
         sections=[_introduction(config)],
-        figures={"claims": [v.figures() for v in verdicts]},
+        metrics={"claims": [v.metrics() for v in verdicts]},
     )
     if verdicts:
         page.findings.append(
@@ -181,7 +181,7 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         shown = {**titled, **references[task]}
         page.sections.append(results.comparison(task, shown, ROWS[OURS].title))
         page.sections += _terms(task, plays[task], records)
-        page.figures[task] = results.figures_of({**rows, **references[task]})
+        page.metrics[task] = results.metrics_of({**rows, **references[task]})
     return page
 
 
@@ -205,10 +205,8 @@ def _longer_training(
 
 
 def _require_reward_head(grid: Grid, rows: Iterable[str]) -> None:
-    """A policy on the Hub is checked by its cells."""
     path = grid.given_policy(grid.trained_on)
-    local = bool(path) and is_local_path(path)
-    given = not local or read_options(policy_folder(path))[0].loss.reward > 0
+    given = bool(path) and read_options(Path(path))[0].loss.reward > 0
     weight = parse_flags(grid.config.train.flags).get("policy.loss.reward", "0")
     trained = weight not in ("0", "0.0")
     for name in rows:
@@ -234,7 +232,7 @@ def _introduction(config: ExperimentConfig) -> str:
     )
 
 
-def _lead(verdicts: Sequence[Verdict], scores: Scores) -> list[str]:
+def _lead(verdicts: Sequence[Verdict], scores: RowScores) -> list[str]:
     lines = []
     ours = [
         _ACHIEVED[task].format(percent(rows[OURS].success_rate))
@@ -306,7 +304,7 @@ def _forest(
     return gain_plot("claims", caption, {"": shown}, label)
 
 
-def _summary(scores: Scores) -> Table:
+def _summary(scores: RowScores) -> Table:
     """The table as in the paper."""
     best = {t: max(each.reward_per_step for each in rows.values()) for t, rows in scores.items()}
     lines = []
@@ -337,7 +335,7 @@ def _terms(task: str, rows: Mapping[str, Sequence[str]], records: results.Record
     """What the reward of each row consists of, if the evaluations recorded it."""
     shares: dict[str, dict[str, float]] = {}
     for name, cells in rows.items():
-        every = (records[c]["figures"][task]["planner"]["played"] for c in cells if c in records)
+        every = (records[c]["metrics"][task]["planner"]["played"] for c in cells if c in records)
         found = [played for played in every if "terms" in played]
         steps = sum(sum(played["steps"]) for played in found)
         for term in found[0]["terms"] if found else ():

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.eval_scores import EvalScores
-from egovcp.spec import ACTION_ETA
+from egovcp.spec import ACTION_ETA, HELD_ETA, HELD_TICKS
 from egovcp_experiment import results
 from egovcp_experiment.experiments.table1 import MODELS, ROWS
 from egovcp_experiment.grid import Grid, Model, parse_flags
@@ -22,14 +22,21 @@ _RETURNS_ROWS: Final = {
     1: ("ours_mc_n1", {**ROWS["ours_mc"].play, "planner.horizon": 1}),
     4: ("ours_mc", ROWS["ours_mc"].play),
 }
+
+
+def _walk(eta: float, least: int, most: int) -> dict[str, str]:
+    """Flags of a random walk of egovcp-collect."""
+    return {"eta": str(eta), "step_ticks": f"[{least},{most}]", "boundary": "reflect"}
+
+
 #: The random walk of `egovcp-collect` by default and of its preset `paper`, as flags.
-_COLLECT_WALK: Final = {"eta": "1.0", "step_ticks": "[5,15]", "boundary": "reflect"}
-_PAPER_WALK: Final = {"eta": str(ACTION_ETA), "step_ticks": "[1,1]", "boundary": "reflect"}
+_COLLECT_WALK: Final = _walk(HELD_ETA, *HELD_TICKS)
+_PAPER_WALK: Final = _walk(ACTION_ETA, 1, 1)
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 type Plans = Mapping[str, Any]
 """Kind of plans -> its analysis in the study `residuals`."""
-type Scores = Mapping[int, EvalScores]
+type HorizonScores = Mapping[int, EvalScores]
 """Horizon -> scores in closed loop."""
 
 
@@ -52,14 +59,14 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         ],
     )
     residuals: dict[str, Plans] = {}
-    own: dict[str, Scores] = {}
-    default: dict[str, Scores] = {}
+    own: dict[str, HorizonScores] = {}
+    default: dict[str, HorizonScores] = {}
     for task in config.tasks:
         flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
         cell = grid.sim_study("residuals", task, {**flags, **walk}, _RETURNS)
         if cell in records:
-            page.figures[task] = {"residuals": records[cell]["figures"]["plans"]}
-            plans = {k: row for k, row in page.figures[task]["residuals"].items() if "rho" in row}
+            page.metrics[task] = {"residuals": records[cell]["metrics"]["plans"]}
+            plans = {k: row for k, row in page.metrics[task]["residuals"].items() if "rho" in row}
             if plans:
                 residuals[task] = plans
             page.sections += [_table(task, kind, row) for kind, row in plans.items()]
@@ -73,16 +80,18 @@ def report(grid: Grid, records: results.Records) -> ExperimentReport:
         shown |= {f"mc, N = {n}": each for n, each in own.get(task, {}).items()}
         if shown:
             page.sections.append(results.comparison(f"{task}: closed loop", shown, "N = 4"))
-            page.figures.setdefault(task, {})["horizons"] = results.figures_of(shown)
+            page.metrics.setdefault(task, {})["horizons"] = results.metrics_of(shown)
         _add_terms(grid, records, page, task, plays)
     page.lead = _lead(residuals, own, default)
     if residuals or default:
-        page.figure = _plot(list(config.tasks), residuals, own, default)
+        page.plot = _plot(list(config.tasks), residuals, own, default)
     return page
 
 
 def _lead(
-    residuals: Mapping[str, Plans], own: Mapping[str, Scores], default: Mapping[str, Scores]
+    residuals: Mapping[str, Plans],
+    own: Mapping[str, HorizonScores],
+    default: Mapping[str, HorizonScores],
 ) -> list[str]:
     rows = {task: plans.get("planner") or plans["random"] for task, plans in residuals.items()}
     lines = []
@@ -113,7 +122,7 @@ def _lead(
     return lines
 
 
-def _best(task: str, scores: Scores) -> str:
+def _best(task: str, scores: HorizonScores) -> str:
     best = max(scores, key=lambda n: scores[n].reward_per_step)
     if best == 4:
         return f"N = 4 ({task})"
@@ -151,7 +160,7 @@ def _add_terms(
     cell = grid.study("plan_terms", task, flags)
     if cell not in records:
         return
-    found = records[cell]["figures"]
+    found = records[cell]["metrics"]
     terms = {
         f"{term} term": EvalScores(
             np.array([row["reward"]]), np.array([row["steps"]]), np.array([row["success"]], float)
@@ -183,8 +192,8 @@ def _add_terms(
             f"{task}: compared with the planner ({percent(scores['planner'].success_rate)}), by "
             f"reward: {', '.join(words)}"
         )
-    page.figures.setdefault(task, {})["terms"] = {
-        **results.figures_of(scores),
+    page.metrics.setdefault(task, {})["terms"] = {
+        **results.metrics_of(scores),
         "spread": found["spread"],
     }
 
@@ -219,8 +228,8 @@ def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
 def _plot(
     tasks: list[str],
     residuals: Mapping[str, Plans],
-    own: Mapping[str, Scores],
-    default: Mapping[str, Scores],
+    own: Mapping[str, HorizonScores],
+    default: Mapping[str, HorizonScores],
 ) -> Plot:
     def paint(figure: Any) -> None:
         rows = figure.subplots(len(tasks), 2, squeeze=False, sharex=True)

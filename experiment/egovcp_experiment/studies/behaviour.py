@@ -27,7 +27,7 @@ from egovcp_experiment.studies import study
 #: A robot has recovered when its pelvis is slower than this for half a second.
 AT_REST_MPS: Final = 0.10
 _REST_TICKS: Final = PLANNER_HZ // 2
-NEAR_NEUTRAL_M: Final = 0.10  # distance at which a hand is back at its start
+NEAR_START_M: Final = 0.10  # distance at which a hand is back at its start
 BACK_TICKS: Final = 2 * PLANNER_HZ
 STANDING_M: Final = 0.70
 FAR_M: Final = 0.9  # distance at which an arch needs no crouch
@@ -42,8 +42,7 @@ class BehaviourConfig(study.SimStudyConfig):
 class BehaviourTrace:
     """One episode, a value per tick."""
 
-    since: list[float] = field(default_factory=list)
-    """s since the event."""
+    since_event_s: list[float] = field(default_factory=list)
     hands: list[Array] = field(default_factory=list)
     """(2, 3) palms in the pelvis frame, m."""
     action: list[Array] = field(default_factory=list)
@@ -52,43 +51,44 @@ class BehaviourTrace:
     """m above ground."""
     speed: list[float] = field(default_factory=list)
     """Horizontal, m/s."""
-    ahead: list[float] = field(default_factory=list)
-    """x of the object in the pelvis frame, m."""
+    object_x_m: list[float] = field(default_factory=list)
+    """In the pelvis frame."""
     hands_on: list[bool] = field(default_factory=list)
     """Whether a hand touches the object."""
     bracing: list[tuple[float, float]] = field(default_factory=list)
-    """Q, and J of holding it, of the oracle's pose while it braces, minus those of the neutral
-    pose, in standard deviations of the return."""
+    """While the oracle braces: Q of its pose, and J of holding it, minus those of the neutral pose,
+    in standard deviations of the return."""
     touched: bool = False
     """Whether the robot has touched the object."""
-    away: bool = False
+    push_is_away: bool = False
     """Whether the push is away from the wall."""
     fallen: bool = False
 
     @property
-    def hands_away(self) -> Array:
-        """(T,) distance of the further hand from its start, m."""
+    def hand_distance_m(self) -> Array:
+        """(T,) distance of the further hand from its start."""
         hands = np.stack(self.hands)
-        away: Array = np.linalg.norm(hands - hands[0], axis=-1).max(axis=-1)
-        return away
+        distance: Array = np.linalg.norm(hands - hands[0], axis=-1).max(axis=-1)
+        return distance
 
     @property
     def hands_back(self) -> bool | None:
-        """Whether both hands return within two seconds of recovery from the push; None if the robot
-        falls or the episode ends earlier."""
-        slow = (np.array(self.speed) < AT_REST_MPS) & (np.array(self.since) > 0)
+        """Whether both hands are back at some time in the two seconds after recovery from the push;
+        None if the robot falls or the episode ends earlier."""
+        slow = (np.array(self.speed) < AT_REST_MPS) & (np.array(self.since_event_s) > 0)
         rest = np.convolve(slow, np.ones(_REST_TICKS), "valid") >= _REST_TICKS
         if self.fallen or not rest.any():
             return None
         start = int(rest.argmax())
-        window = self.hands_away[start : start + BACK_TICKS]
-        back = bool((window < NEAR_NEUTRAL_M).any())
+        window = self.hand_distance_m[start : start + BACK_TICKS]
+        back = bool((window < NEAR_START_M).any())
         return back if back or len(window) == BACK_TICKS else None
 
     @property
     def contact_s(self) -> float | None:
         """Time from the push to the first contact of a hand, s; None without."""
-        times = [s for s, on in zip(self.since, self.hands_on, strict=True) if on and s >= 0]
+        ticks = zip(self.since_event_s, self.hands_on, strict=True)
+        times = [s for s, on in ticks if on and s >= 0]
         return times[0] + PLANNER_DT if times else None
 
 
@@ -118,13 +118,14 @@ def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) 
                 if episode in oracle and oracle[episode].any():
                     trace.bracing.append(_bracing(artifact, step.carry.row(row), oracle[episode]))
                 oracle[episode] = instance.task.oracle()
-            trace.since.append(float(state.since_event[row]))
+            trace.since_event_s.append(float(state.since_event[row]))
             trace.hands.append(state.hands_b[row])
             trace.action.append(step.result.sent_action[row].copy())
             trace.pelvis.append(float(state.pelvis_w[row, 2]))
             trace.speed.append(float(np.hypot(*state.pelvis_velocity_w[row, :2])))
-            trace.ahead.append(float(state.object_b[row, 0]))
-            trace.away = abs(step.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
+            trace.object_x_m.append(float(state.object_b[row, 0]))
+            bearing = step.env.parameters[row].get("push_bearing", 0.0)
+            trace.push_is_away = abs(bearing) > np.pi / 2
             trace.hands_on.append(instance.contacts()["hands"])
             trace.touched |= bool(instance.task.forces.any())
             trace.fallen = bool(step.result.terminated[row])
@@ -133,7 +134,7 @@ def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) 
 
 @torch.no_grad()
 def _bracing(artifact: Artifact, carry: Carry, pose: Array) -> tuple[float, float]:
-    """`BehaviourTrace.bracing` of a pose (7,)."""
+    """(Q, J) of a pose (7,) minus those of the neutral pose, see `BehaviourTrace.bracing`."""
     model = artifact.world_model
     poses = torch.as_tensor(np.stack([pose, np.zeros_like(pose)])[None]).to(carry.h)
     q = model.value(model.expand_candidates(carry), poses)[0]
@@ -144,15 +145,17 @@ def _bracing(artifact: Artifact, carry: Carry, pose: Array) -> tuple[float, floa
 
 def _ball(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
     return {
-        "empty_scene": _means([t.hands_away for t in empty]),
-        "before_throw": _means([t.hands_away[np.array(t.since) < 0] for t in eventful]),
-        "after_throw": _means([t.hands_away[np.array(t.since) > 0] for t in eventful]),
+        "empty_scene": _means([t.hand_distance_m for t in empty]),
+        "before_throw": _means(
+            [t.hand_distance_m[np.array(t.since_event_s) < 0] for t in eventful]
+        ),
+        "after_throw": _means([t.hand_distance_m[np.array(t.since_event_s) > 0] for t in eventful]),
         "empty_scene_effort": _means([np.square(np.stack(t.action)).mean(-1) for t in empty]),
     }
 
 
 def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
-    pushed = [trace for trace in eventful if not trace.away]
+    pushed = [trace for trace in eventful if not trace.push_is_away]
     back = [flag for trace in pushed if (flag := trace.hands_back) is not None]
     times = [trace.contact_s for trace in pushed]
     values = [np.array(trace.bracing) for trace in pushed if trace.bracing]
@@ -166,13 +169,13 @@ def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str,
         "hands_back": _share(back),
         "pushed": len(pushed),
         "recovered": len(back),
-        "empty_scene": _means([t.hands_away for t in empty]),
+        "empty_scene": _means([t.hand_distance_m for t in empty]),
     }
 
 
 def _far(trace: BehaviourTrace) -> Any:
     """(T,) whether the arch is further than `FAR_M` from the pelvis."""
-    return np.abs(trace.ahead) > FAR_M
+    return np.abs(trace.object_x_m) > FAR_M
 
 
 def _arch(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:

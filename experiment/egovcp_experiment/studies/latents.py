@@ -7,7 +7,7 @@ the tick they explain.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp.bounds import bounded
+from egovcp.errors import UsageError
 from egovcp_experiment.config import TASKS
 from egovcp_experiment.studies import study
 
@@ -23,15 +24,19 @@ _NEIGHBOURS: Final = 10
 
 
 @dataclass(frozen=True)
-class LatentsConfig(study.SimStudyConfig):
+class LatentsConfig(study.ScenariosConfig):
     """Maps of h and z over several tasks."""
 
-    task: str = "all"
-    """Unused; see --tasks."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to play."""
     points: int = bounded(1200, least=4)
     """States in a map, evenly spread over all steps."""
+
+    def check(self) -> None:
+        """See `StudyConfig.check`."""
+        super().check()
+        if not self.tasks:
+            raise UsageError("--tasks=[]: expected at least one task")
 
 
 def measure(config: LatentsConfig) -> None:
@@ -39,7 +44,8 @@ def measure(config: LatentsConfig) -> None:
     artifact = config.load()
     rows: list[tuple[Tensor, Tensor, int, int, int]] = []
     for number, name in enumerate(config.tasks):
-        for step in study.play_episodes(artifact, config.env, replace(config, task=name)):
+        play = study.SimStudyConfig(task=name, episodes=config.episodes, seed=config.seed)
+        for step in study.play_episodes(artifact, config.env, play):
             carry = step.carry.map(lambda x: x.cpu())
             for row in step.live:
                 facts = (number, step.scenarios[row].episode, int(step.tick[row]))
@@ -47,15 +53,15 @@ def measure(config: LatentsConfig) -> None:
     chosen = np.unique(np.linspace(0, len(rows) - 1, config.points).astype(int)).tolist()
     h, z, *numbers = zip(*(rows[i] for i in chosen), strict=True)
     task, episode, tick = map(torch.tensor, numbers)
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "tasks": list(config.tasks),
         "task": task.tolist(),
         "tick": tick.tolist(),
     }
     for name, points in (("h", torch.stack(h)), ("z", torch.stack(z))):
         flat = tsne_map(points).round(3).tolist()
-        figures[name] = neighbours(points, task, episode, tick) | {"map": flat}
-    config.write(figures)
+        metrics[name] = neighbours(points, task, episode, tick) | {"map": flat}
+    config.write(metrics)
 
 
 def tsne_map(points: Tensor, perplexity: float = 30.0) -> NDArray[np.float64]:

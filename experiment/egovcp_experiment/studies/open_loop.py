@@ -4,9 +4,8 @@ Starts after a ball has been in flight for a few frames, after a push, or on the
 imagines under the actions that were sent.
 
 Depth errors are mean absolute differences in m over the valid pixels of the target frame, whose
-small holes are closed; empty predictions count as the end of the range. So they are defined as in
-``egovcp-eval-model``, except for moving pixels: here they differ from the last observed image,
-there from the frame before.
+small holes are closed; empty predictions count as the end of the range. Changed pixels differ from
+the last observed image, moving pixels of ``egovcp-eval-model`` from the frame before.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ HORIZONS: Final = tuple(range(0, 17, 2))
 #: Seconds from the event to the last observed image.
 SEEN_S: Final = {"ball": 0.28, "wall": 0.08, "arch": 1.2}
 _SHOWN: Final = 2  # episodes whose images are kept
-_MOVING_M: Final = 0.2  # change of depth of a moving pixel
+_CHANGED_M: Final = 0.2  # change of depth of a changed pixel
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,8 @@ def measure(config: OpenLoopConfig) -> None:
     max_m = artifact.world_model.config.depth_max_m
     near = nearness(torch.from_numpy(depth.astype(np.int32)), max_m)
     seen = to_metres(near, max_m).double().numpy().reshape(shape)
-    moving = abs(seen[:, 1:] - seen[:, :1]) > _MOVING_M
-    most_moving = np.argsort(-moving.mean(axis=(1, 2, 3)), kind="stable")[:_SHOWN]
+    changed = abs(seen[:, 1:] - seen[:, :1]) > _CHANGED_M
+    most_changed = np.argsort(-changed.mean(axis=(1, 2, 3)), kind="stable")[:_SHOWN]
     config.write(
         {
             "episodes": len(clips),
@@ -69,7 +68,7 @@ def measure(config: OpenLoopConfig) -> None:
             },
             "strips": [
                 {"seen": _centimetres(seen[i]), "imagined": _centimetres(imagined[i])}
-                for i in most_moving
+                for i in most_changed
             ],
         }
     )
@@ -103,16 +102,16 @@ def _imagine(model: WorldModel, clip: _Clip) -> Array:
 
 
 def _errors(model: Array, truth: Array, last: Array, max_m: float) -> dict[str, float | None]:
-    """Errors over all valid pixels and over moving ones, of the model and of the last observed
+    """Errors over all valid pixels and over changed ones, of the model and of the last observed
     image repeated; (C, H, W) m, 0: nothing in range."""
     valid = truth > 0
     model, truth, last = (np.where(x > 0, x, max_m) for x in (model, truth, last))
-    moving = valid & (abs(truth - last) > _MOVING_M)
+    changed = valid & (abs(truth - last) > _CHANGED_M)
     return {
         "model": _mean(abs(model - truth), valid),
         "repeat": _mean(abs(last - truth), valid),
-        "model_moving": _mean(abs(model - truth), moving),
-        "repeat_moving": _mean(abs(last - truth), moving),
+        "model_changed": _mean(abs(model - truth), changed),
+        "repeat_changed": _mean(abs(last - truth), changed),
     }
 
 

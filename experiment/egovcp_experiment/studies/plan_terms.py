@@ -67,6 +67,11 @@ class TermEvaluator(NamedTuple):
     shorter: PlanEvaluator[Carry] | None
     """V_{n-1}; None of the first."""
 
+    @property
+    def backend(self) -> str:
+        """See `PlanEvaluator`."""
+        return self.mean.backend
+
     def at(self, carry: Carry) -> PlanValue:
         """See `PlanEvaluator`."""
         mean = self.mean.at(carry)
@@ -115,7 +120,7 @@ def measure(config: PlanTermsConfig) -> None:
         rows = [row for row in step.live if step.tick[row] % _EVERY == 0]
         if rows:
             carry = step.carry.map(lambda x: x[rows])
-            sent = torch.as_tensor(step.env.sent_action[rows], dtype=torch.float32)
+            sent = torch.as_tensor(step.sent_before[rows], dtype=torch.float32)
             plans = _random_plans(artifact, sent, generator)
             variances.append(torch.stack([t.at(carry)(plans, None).var(1) for t in terms], -1))
 

@@ -12,13 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-
 from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
-from egovcp.plan import PlannerConfig, Policy
+from egovcp.plan import PlannerConfig, Policy, blank_observation
 from egovcp.plan.config import OptimiserName
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM
 from egovcp_experiment.studies import study
 
 #: Search -> its optimiser and iterations.
@@ -72,9 +69,9 @@ def measure(config: PlanTimeConfig) -> None:
 
 
 def _median_times[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:
-    """Median time of a plan, ms."""
-    depth = np.full((1, DEPTH_ROWS, DEPTH_COLS), 3000, np.uint16)
-    state = np.zeros((1, STATE_DIM), np.float32)
+    """Median time of a plan, ms, of policies of one robot."""
+    robot = next(iter(policies.values())).model.robot
+    depth, state = blank_observation(1, robot)
     times: dict[K, list[float]] = {key: [] for key in policies}
     for turn in range(rounds + 1):
         for key, policy in policies.items():

@@ -106,9 +106,8 @@ def _starts(artifact: Artifact, config: ResidualsConfig) -> list[_Start]:
             past = sent[scenario.episode]
             event = int(step.env.parameters[row]["event_tick"])
             if int(step.tick[row]) == max(0, event + after[scenario.episode % len(after)]):
-                last = past[-1] if past else np.zeros(ACTION_DIM)
                 deltas = 2 * torch.rand(STEPS, ACTION_DIM, generator=generator) - 1
-                executed = torch.as_tensor(last, dtype=torch.float32)
+                executed = torch.as_tensor(step.sent_before[row], dtype=torch.float32)
                 plans = {
                     "planner": step.decision.plan[row].astype(np.float64),
                     "random": random_walk(executed, deltas, eta).double().numpy(),

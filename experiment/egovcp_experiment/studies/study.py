@@ -18,6 +18,7 @@ from egovcp.artifact import Artifact
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.eval_scores import Array
 from egovcp.files import user_path, write_json
 from egovcp.model import Carry
 from egovcp.outputs import require_writable
@@ -75,20 +76,18 @@ class StudyConfig:
         self.policy.require()
         return load_policy(self.policy, self.planner)
 
-    def write(self, figures: Mapping[str, Any]) -> None:
+    def write(self, metrics: Mapping[str, Any]) -> None:
         """Write the result into the folder."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(self.folder / RESULT, figures)
+        write_json(self.folder / RESULT, metrics)
 
 
 @dataclass(frozen=True)
-class SimStudyConfig(StudyConfig):
-    """Options of the studies in simulation."""
+class ScenariosConfig(StudyConfig):
+    """Options of the studies in simulation, of one task or of several."""
 
-    task: str = DEFAULT_TASK
-    """Task to play."""
     episodes: int = bounded(16, least=1)
-    """Number of scenarios."""
+    """Number of scenarios of a task."""
     seed: int = bounded(0, least=0)
     """Seed of the scenarios."""
     env: EnvConfig = field(default_factory=evaluation_config)
@@ -99,6 +98,14 @@ class SimStudyConfig(StudyConfig):
         artifact = super().load()
         artifact.require_controller(make_controller(self.env.controller).id)
         return artifact
+
+
+@dataclass(frozen=True)
+class SimStudyConfig(ScenariosConfig):
+    """Options of the studies of one task in simulation."""
+
+    task: str = DEFAULT_TASK
+    """Task to play."""
 
     def require_task(self, known: Sequence[str] | Mapping[str, object]) -> None:
         """Raise `UsageError` unless the task is one of ``known``."""
@@ -142,6 +149,8 @@ class PlayedStep:
     """Before the step, with its observation."""
     tick: NDArray[np.int64]
     """(E,) before the step."""
+    sent_before: Array
+    """(E, 7) action sent in the step before; neutral in the first step."""
     live: list[int]
     """Rows whose episode was not over."""
     observation: Observation
@@ -172,7 +181,7 @@ def play_episodes(
                     decision = policy.act(observation.depth, observation.state)
                     live = [int(row) for row in np.flatnonzero(~env.done)]
                     carry, tick = policy.carry.map(torch.clone), np.array(env.tick)
-                    before = (env.privileged_state(), carry, tick)
+                    before = (env.privileged_state(), carry, tick, env.sent_action)
                     result = env.step(decision.action)
                     policy.advance(result.sent_action)
                     yield PlayedStep(group, env, *before, live, observation, decision, result)

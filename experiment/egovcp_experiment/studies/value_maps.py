@@ -20,7 +20,7 @@ from egovcp.artifact import Artifact
 from egovcp.eval_scores import Array
 from egovcp.plan import hand_grid, value_map
 from egovcp.plan.value_map import HAND_AXES
-from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_RATE_LIMIT, PLANNER_DT
+from egovcp.spec import ACTION_BOX, ACTION_RATE_LIMIT, PLANNER_DT
 from egovcp_experiment.studies import study
 
 BEFORE_S: Final = 0.4  # time of the first map before the throw
@@ -54,7 +54,6 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
     """Each map once per episode."""
     maps: dict[tuple[int, str], _Map] = {}
     aims: Aims = {}
-    sent: dict[int, Array] = {}
     for step in study.play_episodes(artifact, config.env, config):
         for row in step.live:
             episode, facts = step.scenarios[row].episode, step.env.parameters[row]
@@ -69,10 +68,9 @@ def _record(artifact: Artifact, config: ValueMapsConfig) -> tuple[list[_Map], Ai
                 found = values.double().cpu().numpy()
                 z, x = np.unravel_index(int(found.argmax()), found.shape)
                 best = (float(grid.x[x]), float(grid.z[z]))
-                reach = _reach(sent.get(episode, np.zeros(ACTION_DIM)), hand)
+                reach = _reach(step.sent_before[row], hand)
                 tick = int(step.tick[row])
                 maps[episode, name] = _Map(episode, name, tick, hand, found, best, reach)
-            sent[episode] = step.result.sent_action[row].copy()
     return list(maps.values()), aims
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.log.picture import grey_image
+from egovcp.log.rollout_video import grey_image
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.gym import EgovcpEnv, GymObservation
 

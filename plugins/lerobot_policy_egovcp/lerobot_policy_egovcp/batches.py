@@ -61,15 +61,16 @@ def to_millimetres(depth: Tensor, check_unit: bool = True) -> Tensor:
 
     Negative and non-finite values become 0, invalid. Raises `DataError` for another type or shape,
     and under ``check_unit`` if nothing is as far as the camera's nearest distance. That shows
-    another unit, or that an object covers the camera: check only the first image of an episode.
+    another unit, or, of a single image, that an object covers the camera: check whole batches of a
+    dataset, but of the images seen by a robot only the first of an episode.
     """
     _require_type(spec.DEPTH_KEY, depth)
     if tuple(depth.shape[-3:]) != FEATURE_SHAPES[spec.DEPTH_KEY]:
         raise _wrong_shape(spec.DEPTH_KEY, depth, "(..., {})")
     # torch has no arithmetic for uint16
     finite = depth.squeeze(-3).float().nan_to_num(0.0, 0.0, 0.0)
-    farthest = float(finite.max()) if finite.numel() else 0.0
-    if check_unit and 0 < farthest < spec.DEPTH_MIN_M * 1e3:
+    farthest = float(finite.max()) if check_unit and finite.numel() else 0.0
+    if 0 < farthest < spec.DEPTH_MIN_M * 1e3:
         raise DataError(
             f"{spec.DEPTH_KEY} is at most {farthest:g}, less than the camera's nearest "
             f"{spec.DEPTH_MIN_M * 1e3:g} mm: the policy reads millimetres, not metres"

@@ -22,7 +22,7 @@ from egovcp import spec
 from egovcp.artifact import CONFIG, Artifact, load_artifact, require_same_returns, write_artifact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.log.picture import grey_image
+from egovcp.log.rollout_video import grey_image
 from egovcp.manifest import FORMAT_KEYS
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.plan import Policy
@@ -106,8 +106,13 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         if config is None:
             config = _read_config(artifact.path)
-        if artifact.world_model.object_head is None:  # as egovcp-train saves it
-            config.world_model = config.world_model.without_object()
+        loss = config.world_model.loss
+        if artifact.world_model.object_head is None and loss.object + loss.multistep_object > 0:
+            raise UsageError(
+                f"{artifact.path} has no object head (egovcp-train does not save it), so that it "
+                "cannot be trained with object losses; give --policy.world_model.loss.object=0 and "
+                "--policy.world_model.loss.multistep_object=0"
+            )
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
             artifact.require_controller(policy._reader.controller_id)

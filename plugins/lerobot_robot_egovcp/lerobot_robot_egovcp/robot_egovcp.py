@@ -34,12 +34,12 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     """Low-level controller: walk, stance, or the file of a trained one."""
     limits: Limits = field(default_factory=Limits)
     """Limits at which the robot holds its pose or its motors are damped."""
-    suffix: str = ""
-    """Ending of the names of states and actions: ``.vel`` for lerobot-rollout, which passes a
+    name_suffix: str = ""
+    """Suffix of the names of states and actions: ``.vel`` for lerobot-rollout, which passes a
     policy only values that are named ``*.pos`` or ``*.vel``."""
-    by_itself: bool = False
-    """Whether `connect` makes the robot stand up, arm and run, for egovcp-fake-g1. Else use its
-    remote control: Y, A, start."""
+    auto_start: bool = False
+    """Whether `connect` requests that the robot stands up, arms and runs, for egovcp-fake-g1. Else
+    use its remote control: Y, A, start."""
 
     @property
     def options(self) -> RobotOptions:
@@ -91,10 +91,17 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         return True
 
     def connect(self, calibrate: bool = True) -> None:
-        """Stand up and run; see `ExternalPolicyRobot.connect` for what can go wrong."""
+        """Wait up to 120 s until the robot runs, brought there by its remote control, or, with
+        ``auto_start``, by requests of this program.
+
+        Raises:
+            DeviceAlreadyConnectedError: it is connected.
+            EnvironmentFailure: robot or camera do not answer, or the robot does not run in time.
+            SafetyStop: its motors were damped.
+        """
         if self._robot is not None:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
-        operator = AutomaticOperator() if self.config.by_itself else None
+        operator = AutomaticOperator() if self.config.auto_start else None
         robot = ExternalPolicyRobot(self.config.options, operator)
         robot.connect()
         self._robot = robot
@@ -127,7 +134,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         robot.close()
 
     def _named(self, names: tuple[str, ...]) -> list[str]:
-        return [name + self.config.suffix for name in names]
+        return [name + self.config.name_suffix for name in names]
 
     @property
     def _running(self) -> ExternalPolicyRobot:

@@ -19,6 +19,7 @@ SETTINGS = Provenance(
     command="egovcp-collect --task=ball --note='a|b'",
     versions={"mujoco": "3.11.0"},
     config=draccus.encode(CollectConfig()),
+    origin="simulated",
 )
 
 

@@ -67,7 +67,7 @@ def test_the_schema_is_complete(text: str) -> None:
         assert f"| {part.start}:{part.stop} |" in text
     box = spec.ACTION_BOX
     for row in zip(spec.ACTION_NAMES, box.low, box.neutral, box.high, strict=True):
-        assert "| `{}` | {:.2f} m | {:.2f} m | {:.2f} m |".format(*row) in text
+        assert "| `{}` | {} | {} | {} |".format(*row) in text
     assert f"`observation.state`, {spec.STATE_DIM} values" in text
 
 
@@ -83,18 +83,53 @@ def test_collection_is_described(text: str) -> None:
     assert SETTINGS.command in text
     assert "mujoco 3.11.0" in text
     assert "stance-1" in text
-    assert "1.0 d with d uniform" in text
+    assert "every 5 to 15 ticks its target g becomes g + 1.0 d with d uniform" in text
+    assert "approaches it by at most 0.32 per tick and is then held" in text
     assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
     assert "`env.ball.block_reward` | 1 | Once" in text
     assert "env.wall." not in text  # no such task in it
-    assert "a step every 5 to 15 ticks" in text
 
 
-def test_a_walk_with_longer_steps_is_described(tmp_path: Path) -> None:
-    known = Provenance("stance-1", seed=5, command="", config={"eta": 1.0, "step_ticks": [5, 9]})
+def test_a_walk_with_a_step_at_every_tick_is_described(tmp_path: Path) -> None:
+    known = Provenance("stance-1", seed=5, config={"eta": 0.32, "step_ticks": [1, 1]})
     root = str(write(tmp_path / "data", [0], known))
     text = card_text(DatasetReader.open(DatasetConfig(root=root)), "me/steps")
-    assert "a step every 5 to 9 ticks. It starts at the" in text
+    assert "section III-B):\na[t] = a[t-1] + 0.32 d with d uniform" in text
+    assert "is then held" not in text
+
+
+@pytest.mark.parametrize(
+    ("origin", "words"),
+    [
+        ("", "| origin | not recorded"),
+        ("recorded", "| origin | recorded rollouts"),
+        ("converted", "| origin | converted from a LeRobot dataset, `me/theirs` 12ab;"),
+    ],
+)
+def test_only_simulated_data_are_called_simulated_and_get_a_licence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], origin: str, words: str
+) -> None:
+    config = {"converted_from": {"repo_id": "me/theirs", "revision": "12ab"}}
+    known = Provenance("stance-1", config=config, origin=origin)
+    root = write(tmp_path / "data", [0], known)
+    assert main(["card", str(root)]) == 0
+    assert "the card names no licence" in capsys.readouterr().out
+    text = (root / "README.md").read_text()
+    assert words in text
+    for claim in ("apache", "Apache", "simulated", "MuJoCo", "randomised", "personal data"):
+        assert claim not in text
+    assert DatasetCard.load(root / "README.md").data.license is None
+
+
+def test_columns_that_the_dataset_lacks_are_not_listed(
+    sound: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(sound)))
+    present = tuple(key for key in reader.features if key not in spec.OPTIONAL_KEYS)
+    monkeypatch.setattr(DatasetReader, "features", present)
+    text = card_text(reader, "me/earlier")
+    assert not [key for key in spec.OPTIONAL_KEYS if f"| `{key}` |" in text]
+    assert "| `next.truncated` | bool | (1,) |" in text
 
 
 def test_every_setting_of_a_task_is_documented() -> None:
@@ -204,13 +239,14 @@ def test_a_merged_dataset_shows_the_settings_of_all_parts(tmp_path: Path) -> Non
     env, folders = SETTINGS.config["env"], []
     for seed, hands in ((5, 0.01), (6, 0.02)):
         part = {**SETTINGS.config, "env": {**env, "pose_cost": hands}}
-        known = Provenance("stance-1", seed=seed, config=part)
+        known = Provenance("stance-1", seed=seed, config=part, origin="simulated")
         folders.append(str(write(tmp_path / f"{seed}", [seed], known)))
     merged = str(tmp_path / "merged")
     assert main(["merge", *folders, f"--output_dir={merged}"]) == 0
     text = card_text(DatasetReader.open(DatasetConfig(root=merged)), "me/merged")
     assert "| seed | 5, 6 |\n" in text
-    assert "a[t] = a[t-1] + 1.0 d with d uniform" in text
+    assert "its target g becomes g + 1.0 d with d uniform" in text
+    assert "license: apache-2.0" in text
     assert "The dataset was merged. Settings that are not the same" in text
     assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
     assert "env.pose_cost" not in text

@@ -23,7 +23,8 @@ TOKEN = "hf_NobodyMayEverSeeThis"
 
 def write(root: Path, episodes: int = 6, shard: int = 4) -> Path:
     """A dataset of random episodes of two tasks."""
-    with DatasetWriter(root, Provenance("stance-1", seed=0), shard_episodes=shard) as writer:
+    provenance = Provenance("stance-1", seed=0, origin="simulated")
+    with DatasetWriter(root, provenance, shard_episodes=shard) as writer:
         for number in range(episodes):
             writer.add(random_episode(number, task=("ball", "wall")[number % 2]))
     return root
@@ -92,10 +93,13 @@ def test_a_card_in_the_folder_is_published_as_it_is(
     assert "README.md is published as it is" in capsys.readouterr().out
 
 
-def test_a_dataset_of_another_robot_is_published_with_a_card(hub: FakeHub, tmp_path: Path) -> None:
+def test_a_dataset_of_another_robot_is_published_with_a_card(
+    hub: FakeHub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with DatasetWriter(tmp_path / "arm", Provenance("arm-1", seed=0)) as writer:
         writer.add(random_episode(0, task="reach", robot=ARM))
     assert push(tmp_path / "arm") == 0
+    assert "the card names no licence" in capsys.readouterr().out
     text = published_card(hub)
     assert "| `observation.images.ego_depth` | image, uint16 | (32, 48, 1) |" in text
     assert "| `b` | -2.0 | 0.0 | 2.0 |" in text

@@ -1,5 +1,6 @@
 """`egovcp-dataset viz`: an episode as a Rerun recording."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ from rerun.experimental import RrdReader
 from egovcp import packages, spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
 from egovcp.data.source import lerobot_home
+from egovcp.errors import DataError
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.log import paths
 from egovcp.robot.kinematics import LINK_NAMES
-from egovcp.rollouts import camera_view, run_info, ticks_of
+from egovcp.rollouts import camera_view, recording_info, ticks_of
+from egovcp.sim.config import EnvConfig
 from egovcp.testing import random_episode
 from egovcp_collect.dataset import viz
 from egovcp_collect.dataset.cli import main
@@ -90,7 +93,7 @@ def test_events_are_recorded(reader: DatasetReader) -> None:
     assert ticks[40].events == ("reward -1.000", "a fall ends the episode")
     assert ticks[40].terminated
     assert not ticks[40].truncated
-    assert [*ticks_of(reader.read(2))][-1].events == ("the time is up",)
+    assert [*ticks_of(reader.read(2))][-1].events == ("the episode is truncated",)
     assert ticks[2].time_ns == 2 * 40_000_000
 
 
@@ -98,7 +101,41 @@ def test_the_camera_has_the_pose_of_the_episode() -> None:
     view = camera_view(SETTINGS.config, {"camera_pitch": 0.05})
     assert view.pitch == 0.05
     assert view.position == (0.058, 0.0, 0.42)
-    assert camera_view({}, {}).vertical_fov > 0
+
+
+def test_a_camera_that_is_not_recorded_is_the_simulated_one() -> None:
+    view, simulated = camera_view({}, {"camera_pitch": None}), EnvConfig().camera
+    assert (view.position, view.vertical_fov) == (simulated.position, simulated.vertical_fov)
+    assert simulated.pitch_range[0] < view.pitch < simulated.pitch_range[1]
+
+
+@pytest.mark.parametrize(
+    ("camera", "facts", "message"),
+    [
+        ({"position": [1, 2]}, {}, r"camera\.position"),
+        ({"vertical_fov": 0}, {}, "vertical_fov=0"),
+        ({"vertical_fov": None}, {}, r"camera\.vertical_fov"),
+        ({}, {"episode": 1.5}, "episode"),
+        ({}, {"seed": "x"}, "seed"),
+    ],
+)
+def test_damaged_facts_are_a_data_error_of_their_file(
+    reader: DatasetReader,
+    monkeypatch: pytest.MonkeyPatch,
+    camera: dict[str, object],
+    facts: dict[str, object],
+    message: str,
+) -> None:
+    known = {"config": {"env": {"camera": camera}}}
+    monkeypatch.setattr(DatasetReader, "provenance", known)
+    with pytest.raises(DataError, match=rf"collection\.json, episode 1: .*{message}"):
+        recording_info(reader, 1, replace(reader.read(1), metadata=facts))
+
+
+def test_facts_that_are_null_are_unknown(reader: DatasetReader) -> None:
+    facts = {"episode": None, "seed": None, "camera_pitch": None}
+    info = recording_info(reader, 1, replace(reader.read(1), metadata=facts))
+    assert (info.seed, info.episode) == (0, 1)
 
 
 def test_the_command_names_the_file_after_dataset_and_episode(
@@ -126,7 +163,7 @@ def test_no_pose_is_mentioned_of_another_robot(
     assert main(["viz", str(root), f"--output={tmp_path / 'arm.rrd'}"]) == 0
     assert "pelvis" not in capsys.readouterr().out
     reader = DatasetReader.open(DatasetConfig(root=str(root)))
-    assert "pose" not in run_info(reader, 0, reader.read(0)).config
+    assert "pose" not in recording_info(reader, 0, reader.read(0)).config
 
 
 def test_mcap_of_a_dataset_of_another_origin_is_refused(

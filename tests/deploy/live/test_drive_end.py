@@ -67,9 +67,9 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[LiveSummar
             "backend_of": lambda policy: "",
             "open_operator": nothing,
             "open_viewer": nothing,
-            "provenance": lambda info: {},
+            "provenance_fields": lambda info: {},
             "recording": recording,
-            "run_info": lambda *arguments: SimpleNamespace(backend=""),
+            "make_run_info": lambda *arguments: SimpleNamespace(backend=""),
             "running_control": running_control,
             "stop_control": lambda process, watchdog, interrupts: None,
         }

@@ -63,6 +63,28 @@ def test_info_as_json(record: Record, tmp_path: Path) -> None:
     }
 
 
+def test_a_torque_that_is_never_finite_is_null(
+    record: Record, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torque = np.where(np.arange(29) == 3, np.nan, 1.0)
+    file = record(keep=lambda tick: replace(tick, motors=MotorReadings(torque)))
+    assert main(["info", str(file), "--json=-"]) == 0
+    maxima = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)["joint_maxima"]
+    assert [m["torque_nm"] for m in maxima.values()] == [1.0] * 3 + [None] + [1.0] * 25
+    assert main(["info", str(file)]) == 0
+    assert "\nleft_knee_joint\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("shapes", [((28,), (29, 1)), ((29,), (28, 1))])
+def test_motors_of_another_robot_are_damage(
+    shapes: tuple[tuple[int, ...], ...], record: Record, capsys: pytest.CaptureFixture[str]
+) -> None:
+    motors = MotorReadings(*(np.ones(shape) for shape in shapes))
+    file = record(keep=lambda tick: replace(tick, motors=motors if tick.index == 2 else None))
+    assert main(["info", str(file)]) == 3
+    assert "tick 2 has torques of" in capsys.readouterr().err
+
+
 def test_a_recording_without_motors_has_no_table(
     record: Record, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,10 @@ import pytest
 from egovcp import packages
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetReader, open_dataset
+from egovcp.errors import DataError
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
-from egovcp.rollouts import CONTROLLER
+from egovcp.rollouts import CONTROLLER, planned_ticks
 from egovcp_collect.dataset.viz import write_recording
 from egovcp_deploy.mcap.cli import main
 
@@ -31,7 +33,7 @@ def test_episode_to_recording_to_episode_is_the_identity(
     assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'back'}"]) == 0
     back = open_dataset(tmp_path / "back")
     assert list(dataset_problems(back.root)) == []
-    assert back.controller_id == dataset.controller_id
+    assert (back.controller_id, back.origin.origin) == (dataset.controller_id, "recorded")
     assert back.provenance["config"] == dataset.provenance["config"]
     for index in range(len(dataset)):
         before, after = dataset.read(index), back.read(index)
@@ -60,6 +62,14 @@ def test_ticks_after_a_fall_are_dropped(
     assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 0
     episode = open_dataset(tmp_path / "new").read(0)
     assert (len(episode), episode.terminated, episode.time_limit) == (6, True, 40)
+
+
+@pytest.mark.parametrize(
+    "config", [{"time_limit": "soon"}, {"env": {"ball_episode": []}}, {"env": [], "seed": 1}]
+)
+def test_a_time_limit_that_is_no_number_is_refused(config: dict[str, object]) -> None:
+    with pytest.raises(DataError, match=r"its configuration is damaged: (time_limit|env)"):
+        planned_ticks(replace(INFO, config=config))
 
 
 def test_rollouts_of_one_scenario_are_different_episodes(record: Record, tmp_path: Path) -> None:
@@ -101,9 +111,12 @@ def test_missing_ticks_are_refused_or_cut(
     assert main(["to-dataset", file, flag]) == 3
     assert "2 ticks are missing after tick 4" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-    assert main(["to-dataset", file, flag, "--gaps=cut"]) == 0
+    command = ["to-dataset", file, flag, "--gaps=cut"]
+    assert main(command) == 0
     assert "cut: 2 ticks are missing after tick 4" in capsys.readouterr().out
-    episode = open_dataset(tmp_path / "new").read(0)
+    reader = open_dataset(tmp_path / "new")
+    assert reader.provenance["command"] == shlex.join(["egovcp-mcap", *command])
+    episode = reader.read(0)
     assert (len(episode), bool(episode.truncated[-1]), episode.time_limit) == (5, True, 5)
     assert list(dataset_problems(tmp_path / "new")) == []
 
@@ -190,8 +203,10 @@ def test_a_run_whose_beginning_is_missing_is_refused(
     missing: tuple[int, ...], record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = record(missing=missing, keep=live if 3 in missing else lambda tick: tick)
-    assert main(["to-dataset", str(path), f"--dataset.root={tmp_path / 'out'}"]) == 3
-    assert "its first ticks are missing" in capsys.readouterr().err
+    for gaps in ("refuse", "cut"):
+        flags = [f"--dataset.root={tmp_path / 'out'}", f"--gaps={gaps}"]
+        assert main(["to-dataset", str(path), *flags]) == 3
+        assert "its first ticks are missing" in capsys.readouterr().err
 
 
 def test_the_same_rollout_twice_is_refused_and_nothing_remains(

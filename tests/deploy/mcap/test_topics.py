@@ -37,10 +37,10 @@ MAPPING = {"fps": RATE_HZ, "task": "pick", "hold": ["/gripper"], "features": FEA
 type Foreign = Callable[..., Path]
 
 
-def _png(pixels: np.ndarray) -> str:
+def _png(pixels: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "PNG")
-    return base64.b64encode(file.getvalue()).decode()
+    return file.getvalue()
 
 
 @pytest.fixture
@@ -48,7 +48,11 @@ def foreign(tmp_path: Path) -> Foreign:
     """``foreign(...)`` writes a recording as of ROS 2 and Foxglove; ``skip`` leaves frames out."""
 
     def write(
-        name: str = "bag.mcap", skip: range = range(0), width: int = 7, joint: float = 1.0
+        name: str = "bag.mcap",
+        skip: range = range(0),
+        width: int = 7,
+        joint: float = 1.0,
+        damage: Callable[[bytes], bytes] = lambda png: png,
     ) -> Path:
         path = tmp_path / name
         with path.open("wb") as file:
@@ -71,7 +75,8 @@ def foreign(tmp_path: Path) -> Foreign:
                     add("/gripper", time, {"width": t / 100})
                 if t in skip:
                     continue
-                add("/camera/front", time, {"format": "png", "data": _png(COLOURS[t])})
+                png = base64.b64encode(damage(_png(COLOURS[t]))).decode()
+                add("/camera/front", time, {"format": "png", "data": png})
                 add("/joint_states", time, {"name": ["a"] * width, "position": [joint * t] * width})
                 add("/command", time, {"layout": {}, "data": [t, -t]})
                 add("/reward", time, 0.5)
@@ -116,6 +121,7 @@ def test_mapped_topics_become_a_dataset(foreign: Foreign, tmp_path: Path) -> Non
         ({"features": {"action": "/command.dat"}}, "no field dat; there are layout, data"),
         ({"features": {"action": "/command.data[9]"}}, "action from /command.data[9]: list index"),
         ({"features": {"action": "/joint_states"}}, "'a' is not a number"),
+        ({"features": {"action": "/command.layout"}}, "action from /command.layout: no number"),
         ({"hold": []}, "/gripper has 1.33 messages per second, but fps is 20"),
         ({"fps": 50}, "20 messages per second, but fps is 50"),
     ],
@@ -142,7 +148,8 @@ def test_a_mapping_that_does_not_fit_is_refused(
         ({"features": {"": "/reward"}}, "'' cannot be the name"),
         ({"features": {"action": []}}, "features.action names no topic"),
         ({"names": {"acton": ["x"]}}, "names has ['acton'], which features has not"),
-        ({"names": {"action": ["x", "y"]}}, "names.action of the mapping: 2 of 1 values"),
+        ({"names": {"action": ["x", "y"]}}, "names.action has 2 names, but the feature has 1 v"),
+        ({"names": {"observation.images.front": ["x"]}}, "1 names, but the feature is an image"),
     ],
 )
 def test_a_wrong_mapping_is_refused(
@@ -175,6 +182,16 @@ def test_a_pause_is_refused_or_cut(
     assert _convert(tmp_path, [file], "--gaps=cut") == 0
     assert dataset_command(["check", str(tmp_path / "new")]) == 0
     assert "12 rows, cut: nothing on" in capsys.readouterr().out
+
+
+def test_a_damaged_image_is_refused(
+    foreign: Foreign, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = foreign(damage=lambda png: png[:37] + b"\0\0\0\0" + png[41:])  # the name of a chunk
+    assert _convert(tmp_path, [file]) == 3
+    error = capsys.readouterr().err
+    assert "bag.mcap, frame 0: observation.images.front from /camera/front: it is not" in error
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_torn_file_is_refused(

@@ -166,6 +166,39 @@ def test_a_requested_hold_ends_only_on_request() -> None:
     assert machine.state is State.RUN
 
 
+def test_a_hold_request_during_a_fault_is_logged_and_becomes_the_reason() -> None:
+    machine = at(State.RUN)
+    fault = replace(WELL, image_age_s=0.5)
+    assert machine.update(fault) == ("run -> hold: no new depth image for 500 ms",)
+    said = "requested by the operator"
+    assert machine.update(fault, OperatorRequest.HOLD) == (f"hold -> hold: {said}",)
+    assert machine.update(fault, OperatorRequest.HOLD) == (), "Ctrl-C repeats it"
+    feed(machine, WELL, 5.0)
+    assert (machine.state, machine.reason) == (State.HOLD, said)
+
+
+def test_a_run_request_in_hold_is_answered() -> None:
+    machine = at(State.RUN)
+    machine.update(WELL, OperatorRequest.HOLD)
+    pending = "hold -> hold: run requested, begins after 1 s without a fault"
+    fault = replace(WELL, image_age_s=0.5)
+    (answer,) = machine.update(fault, OperatorRequest.RUN)
+    assert answer == f"{pending}; now: no new depth image for 500 ms"
+    assert machine.update(WELL, OperatorRequest.RUN) == (pending,)
+    feed(machine, WELL, 1.1)
+    assert machine.state is State.RUN
+
+
+@pytest.mark.parametrize("state", [State.RUN, State.HOLD])
+@pytest.mark.parametrize("name", ["stand", "arm", "run"])
+def test_requests_that_the_state_does_not_allow_are_refused(state: State, name: str) -> None:
+    machine = at(state)
+    lines = machine.update(WELL, OperatorRequest(name))
+    assert machine.state is state
+    if (state, name) != (State.HOLD, "run"):
+        assert lines == (f"{name} refused: the robot is in {state}",)
+
+
 def test_a_low_robot_may_stand_up_but_not_be_armed() -> None:
     machine = at(State.STAND)
     low = replace(WELL, height=0.3)

@@ -11,6 +11,7 @@ import zmq
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.g1 import DAMPING, STIFFNESS
+from egovcp_deploy.robots import wire
 from egovcp_deploy.robots.base import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot, mode_refusal, mode_warning
 from egovcp_deploy.robots.fake.bridge import MODE, FakeBridge
@@ -81,8 +82,8 @@ def test_read_returns_the_last_reading_without_messages(
 
 def test_repeated_readings_are_ignored(fake: FakeBridge) -> None:
     robot, payload = BridgeRobot(), fake._encode_state()
-    assert robot._handle(payload, 1)
-    assert not robot._handle(payload, 2)
+    assert robot._handle(payload, 1, 0)
+    assert not robot._handle(payload, 2, 0)
     assert robot.read().time_ns == 1
 
 
@@ -93,6 +94,17 @@ def test_truncated_messages_are_dropped(robot: BridgeRobot, running: FakeG1Threa
     for _ in range(3):
         last = robot.read()
         assert eventually(lambda last=last: robot.read() is not last)
+
+
+def test_an_unforeseen_error_rejects_its_message_and_reading_goes_on(
+    robot: BridgeRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The runner holds and damps with this reason if every message fails."""
+    with monkeypatch.context() as broken:
+        broken.setattr(wire, "decode_state", lambda payload, time_ns: 1 // 0)
+        assert eventually(lambda: "ZeroDivisionError" in robot.rejected)
+        last = robot.read()
+    assert eventually(lambda: robot.read() is not last and not robot.rejected)
 
 
 def test_an_invalid_command_is_not_sent(robot: BridgeRobot, running: FakeG1Thread) -> None:

@@ -109,9 +109,9 @@ def test_received_images_are_those_of_the_robot(
 
 def test_a_repeated_image_is_ignored() -> None:
     camera, message = ZmqDepthCamera(), encode_frame(DepthFrame(7, FOV, noise()))
-    assert camera._handle(message, 1)
+    assert camera._handle(message, 1, 0)
     first = camera.read()
-    assert not camera._handle(message, 2)
+    assert not camera._handle(message, 2, 0)
     assert camera.read() is first
 
 
@@ -282,13 +282,11 @@ class FakeDepthCamera:
 
 def test_an_image_that_arrives_together_with_a_newer_one_is_not_lost() -> None:
     camera = ZmqDepthCamera()
-    camera._subscriber = SimpleNamespace(older=0)  # type: ignore[assignment]
     for sequence, older in ((1, 0), (2, 0), (4, 1)):
-        camera._subscriber.older = older
-        assert camera._handle(encode_frame(DepthFrame(sequence, FOV, noise(sequence))), sequence)
+        message = encode_frame(DepthFrame(sequence, FOV, noise(sequence)))
+        assert camera._handle(message, sequence, older)
     assert camera.arrivals.stats(5).lost == 0.0
-    camera._subscriber.older = 0
-    assert camera._handle(encode_frame(DepthFrame(6, FOV, noise())), 6)
+    assert camera._handle(encode_frame(DepthFrame(6, FOV, noise())), 6, 0)
     assert camera.arrivals.stats(6).lost == 1 / 5
 
 
@@ -298,8 +296,8 @@ def test_depth_server_publishes_each_image_once() -> None:
     camera = ZmqDepthCamera(ZmqCameraConfig(port=server.port))
     handle, new = camera._handle, list[bool]()  # whether each message has a new image
 
-    def record(message: bytes, time_ns: int) -> bool:
-        new.append(handle(message, time_ns))
+    def record(message: bytes, time_ns: int, older: int) -> bool:
+        new.append(handle(message, time_ns, older))
         return new[-1]
 
     camera._handle = record  # type: ignore[method-assign]

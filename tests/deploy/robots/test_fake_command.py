@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
+import queue
 import signal
 from pathlib import Path
 
 import pytest
 
 from egovcp_deploy.robots.bridge import BridgeRobot
-from egovcp_deploy.robots.fake.command import StepPacer, main
+from egovcp_deploy.robots.fake.command import StepPacer, _read_lines, main
 from tests.support.lockstep import LockstepClock
 from tests.support.robots.fake_g1 import bridge_config, fake_g1_process
 
@@ -70,6 +72,20 @@ def test_bad_options_are_refused(
 ) -> None:
     assert main([STANCE, flag]) == code
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stdin", "expected"),
+    [(None, []), (io.TextIOWrapper(io.BytesIO(b"\xff\nquit\n"), "utf-8"), ["\\xff", "quit"])],
+    ids=["closed", "not UTF-8"],
+)
+def test_no_input_ends_the_reading_of_commands(
+    stdin: io.TextIOWrapper | None, expected: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", stdin)
+    lines = queue.SimpleQueue[str]()
+    _read_lines(lines)
+    assert [lines.get_nowait() for _ in range(lines.qsize())] == expected
 
 
 def test_late_steps_are_made_up_for_up_to_a_limit() -> None:

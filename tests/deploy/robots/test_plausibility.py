@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import VELOCITY_LIMIT
 from egovcp.spec import JOINT_NAMES
+from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.base import LowState
 from egovcp_deploy.robots.plausibility import JUMP_RESYNC_S, RESYNC_S, PlausibilityFilter
 from tests.support.robots.healthy_run import HealthyRun, Situation
@@ -152,7 +153,7 @@ def test_random_readings_within_bounds_are_rejected() -> None:
 def test_a_position_jump_is_accepted_after_the_damping_limit() -> None:
     found = problems(position(0.5), duration=200)
     accepted = found.index("")
-    assert 0.2 < accepted * STEP_NS * 1e-9 < 2 * RESYNC_S
+    assert Limits().state_damp_s < accepted * STEP_NS * 1e-9 < 2 * RESYNC_S
     assert not any(found[accepted:])
 
 

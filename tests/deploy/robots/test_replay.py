@@ -18,7 +18,8 @@ from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.sim.config import EnvConfig, EpisodeConfig
-from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
+from egovcp_deploy.pilot.pilot import REJECTED
+from egovcp_deploy.pilot.planner import SKIPPED, InlinePlanner, PlannerRunner
 from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.rollouts import run_rollout
@@ -147,6 +148,31 @@ def test_a_live_run_begins_with_the_first_tick_in_run(
     np.testing.assert_array_equal(robot.observe().state, ticks[0].state)
     ended = [robot.act(np.zeros(7)).truncated for _ in range(TICKS)]
     assert ended == [False] * (TICKS - 1) + [True]
+
+
+def test_recorded_events_are_marked(recorded: tuple[Path, list[Watched]], tmp_path: Path) -> None:
+    """They are not those of the plans that the replay makes."""
+    recording = read_recording(recorded[0] / "rollout-0.mcap")
+    lines = (SKIPPED, REJECTED, "run -> hold: the planner has ended")
+    write(tmp_path / "a.mcap", recording.info, [replace(t, events=lines) for t in recording.ticks])
+    robot = open_recordings(tmp_path / "a.mcap")
+    assert robot.act(np.zeros(7)).events == tuple(f"recorded: {line}" for line in lines)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["rollout-2", "rollout-9", "rollout-10"],
+        ["run1-rollout-9", "run1-rollout-10", "run2-rollout-1"],
+        ["rollout-1", "rollout-²"],
+    ],
+)
+def test_recordings_are_played_in_the_order_of_their_numbers(
+    names: list[str], recorded: tuple[Path, list[Watched]], tmp_path: Path
+) -> None:
+    for name in names:
+        (tmp_path / f"{name}.mcap").symlink_to(recorded[0] / "rollout-0.mcap")
+    assert [path.stem for path in open_recordings(tmp_path).files] == names
 
 
 def write(path: Path, info: RunInfo, ticks: list[Tick]) -> None:

@@ -9,6 +9,7 @@ import pytest
 import zmq
 
 from egovcp_deploy.robots.subscriber import _QUEUE, ArrivalMonitor, Subscriber
+from egovcp_deploy.robots.wire import MalformedMessage
 from tests.support.robots.fake_g1 import eventually
 
 
@@ -24,9 +25,12 @@ def publisher() -> Iterator[zmq.Socket[bytes]]:
 def listen(publisher: zmq.Socket[bytes]) -> Iterator[Callable[..., Subscriber]]:
     listeners: list[Subscriber] = []
 
-    def make(take: Callable[[bytes, int], bool]) -> Subscriber:
+    def make(
+        take: Callable[[bytes, int, int], bool],
+        reject: Callable[[str, int], None] = lambda problem, time_ns: None,
+    ) -> Subscriber:
         port = int(publisher.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
-        listeners.append(Subscriber("127.0.0.1", port, 100_000, take))
+        listeners.append(Subscriber("127.0.0.1", port, 100_000, take, reject))
         return listeners[-1]
 
     yield make
@@ -37,24 +41,46 @@ def listen(publisher: zmq.Socket[bytes]) -> Iterator[Callable[..., Subscriber]]:
 def test_newest_usable_message_is_taken(
     listen: Callable[..., Subscriber],
 ) -> None:
-    tried: list[bytes] = []
-    older: list[int] = []
+    tried: list[tuple[bytes, int]] = []
 
-    def take(message: bytes, time_ns: int) -> bool:
-        tried.append(message)
-        older.append(listener.older)
+    def take(message: bytes, time_ns: int, older: int) -> bool:
+        tried.append((message, older))
         return message.startswith(b"good")
 
-    listener = listen(take)
-    assert listener._handle_newest([b"good 1", b"bad", b"good 2", b"bad", b"bad"])
-    assert tried == [b"bad", b"bad", b"good 2"]
-    assert older == [4, 3, 2]
+    assert listen(take)._handle_newest([b"good 1", b"bad", b"good 2", b"bad", b"bad"])
+    assert tried == [(b"bad", 4), (b"bad", 3), (b"good 2", 2)]
+
+
+def test_no_message_ends_the_thread(
+    publisher: zmq.Socket[bytes], listen: Callable[..., Subscriber]
+) -> None:
+    heard: list[bytes] = []
+    rejected: list[str] = []
+
+    def take(message: bytes, time_ns: int, older: int) -> bool:
+        if message == b"short":
+            raise MalformedMessage("too short")
+        if message == b"bug":
+            raise KeyError("q")
+        heard.append(message)
+        return True
+
+    listener = listen(take, lambda problem, time_ns: rejected.append(problem))
+    assert listener._handle_newest([b"good", b"short", b"bug"])
+    assert (heard, rejected) == ([b"good"], ["KeyError('q')", "too short"])
+
+    def received() -> bool:
+        for message in (b"bug", b"good", b"bug"):
+            publisher.send(message)
+        return len(heard) > 3 and len(rejected) > 5
+
+    assert eventually(received)
 
 
 def test_processing_time_of_a_flood_is_bounded(listen: Callable[..., Subscriber]) -> None:
     tried: list[bytes] = []
 
-    def slow(message: bytes, time_ns: int) -> bool:
+    def slow(message: bytes, time_ns: int, older: int) -> bool:
         tried.append(message)
         time.sleep(0.0015)
         return False
@@ -66,7 +92,7 @@ def test_processing_time_of_a_flood_is_bounded(listen: Callable[..., Subscriber]
 def test_messages_of_a_full_queue_are_dropped(listen: Callable[..., Subscriber]) -> None:
     """What waits in it may be older than it seems."""
     tried: list[bytes] = []
-    listener = listen(lambda message, time_ns: bool(tried.append(message)) or True)
+    listener = listen(lambda message, time_ns, older: bool(tried.append(message)) or True)
     assert not listener._handle_newest([b"good"] * _QUEUE)
     assert not tried
 
@@ -76,7 +102,7 @@ def test_usable_messages_are_received_during_a_flood(
 ) -> None:
     heard: list[bytes] = []
 
-    def take(message: bytes, time_ns: int) -> bool:
+    def take(message: bytes, time_ns: int, older: int) -> bool:
         if message.startswith(b"good"):
             heard.append(message)
         return message.startswith(b"good")
@@ -99,7 +125,7 @@ def test_a_flood_uses_little_processor_time(
     """The interpreter's lock must be free for the control loop."""
     busy = [0.0]
 
-    def take(message: bytes, time_ns: int) -> bool:
+    def take(message: bytes, time_ns: int, older: int) -> bool:
         begin = time.thread_time()
         while time.thread_time() - begin < 0.0005:
             pass

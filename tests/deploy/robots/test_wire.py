@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import sys
 from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
@@ -180,21 +181,21 @@ def test_command_round_trip() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "words"),
     [
-        {"position": np.full(29, np.nan)},
-        {"position": np.full(29, np.inf)},
-        {"position": np.full(29, 1e9)},
-        {"position": np.zeros(28)},
-        {"position": TARGETS - 0.01 * (COUNT == 0)},
-        {"position": TARGETS + 0.01 * (COUNT == 28)},
-        {"stiffness": np.full(29, -1.0)},
-        {"damping": np.full(29, -np.inf)},
-        {"damping": np.full(29, 1e9)},
+        ({"position": np.full(29, np.nan)}, "position of left_hip_pitch_joint is nan, expected -"),
+        ({"position": np.full(29, np.inf)}, "is inf"),
+        ({"position": np.full(29, 1e9)}, "is 1e+09, expected -10 to 10"),
+        ({"position": np.zeros(28)}, "position has shape (28,), expected (29,)"),
+        ({"position": TARGETS - 0.01 * (COUNT == 0)}, "target of left_hip_pitch_joint is"),
+        ({"position": TARGETS + 0.01 * (COUNT == 28)}, "target of right_wrist_yaw_joint is"),
+        ({"stiffness": np.full(29, -1.0)}, "stiffness of left_hip_pitch_joint is -1, expected 0"),
+        ({"damping": np.where(COUNT == 3, -np.inf, 1.0)}, "damping of left_knee_joint is -inf"),
+        ({"damping": np.full(29, 1e9)}, "is 1e+09, expected 0 to 10000"),
     ],
 )
-def test_an_invalid_command_is_not_encoded(changes: dict[str, Any]) -> None:
-    with pytest.raises(MalformedMessage):
+def test_an_invalid_command_is_not_encoded(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(MalformedMessage, match=re.escape(words)):
         encode_command(command(**changes))
 
 

@@ -63,6 +63,16 @@ def test_a_hub_id_is_fetched_at_its_revision(hub: FakeHub, original: Path, commi
     assert not hub.requests, "a commit that is here cannot have changed"
 
 
+def test_a_hub_id_beside_a_folder_of_its_user_needs_a_revision(
+    commit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "me").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArtifactError, match="with a revision such as main if a folder 'user'"):
+        load_artifact("me/policy")
+    assert load_artifact("me/policy", "main").path.name == commit
+
+
 def test_only_data_is_fetched(hub: FakeHub, commit: str) -> None:
     found = load_artifact("me/policy", commit).path
     assert {path.name for path in found.iterdir()} == FILES

@@ -237,6 +237,46 @@ def test_a_root_that_cannot_be_renamed_loses_nothing(
     assert _size(root) == 2
 
 
+def test_a_failed_exchange_by_renames_restores_the_dataset(
+    tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, rename = tmp_path / "d", dataset_files.rename
+
+    def unsupported(one: Path, other: Path) -> None:
+        raise OSError(errno.EINVAL, "not here")
+
+    def failing(source: Path, target: Path) -> None:
+        if source.name == "next" and target == root:
+            raise OSError(errno.EIO, "disk failure")
+        rename(source, target)
+
+    _collect(root, episodes[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset_files, "exchange", unsupported)
+        patch.setattr(dataset_files, "rename", failing)
+        with pytest.raises(OSError, match="disk failure"):
+            _collect(root, episodes[:2], resume=True)
+    assert _size(root) == 1
+
+
+def test_folders_beside_the_data_are_flushed_in_the_next_version(
+    tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, sync, synced = tmp_path / "d", dataset_files.sync, set[str]()
+    _collect(root, episodes[:1])
+    (root / "assets").mkdir()
+    (root / "assets" / "plot.png").write_bytes(b"plot")
+
+    def recorded(path: Path) -> None:
+        synced.add(path.name)
+        sync(path)
+
+    monkeypatch.setattr(dataset_files, "sync", recorded)
+    _collect(root, episodes[:2], resume=True)
+    assert (root / "assets" / "plot.png").read_bytes() == b"plot"
+    assert "plot.png" in synced
+
+
 def test_exchange_without_renameat2_is_not_supported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

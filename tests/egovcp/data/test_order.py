@@ -80,10 +80,10 @@ def test_resuming_with_other_weights_is_refused(both: EpisodeStore) -> None:
     ("mix", "message"),
     [
         (Mix(datasets=(1.0,)), "1 weights for 2 datasets"),
-        (Mix(datasets=(1.0, -1.0)), "weight of -1.0"),
+        (Mix(datasets=(1.0, -1.0)), "--datasets: a weight of -1.0"),
         (Mix(datasets=(0.0, 0.0)), "no episode to draw"),
-        (Mix(tasks={"wal": 1.0}), "did you mean 'wall'"),
-        (Mix(tasks={"ball": float("nan")}), "weight of nan"),
+        (Mix(tasks={"wal": 1.0}), "training episode is of task 'wal'; did you mean 'wall'"),
+        (Mix(tasks={"ball": float("nan")}), "--sampling.tasks: a weight of nan"),
     ],
 )
 def test_invalid_weights_are_refused(both: EpisodeStore, mix: Mix, message: str) -> None:

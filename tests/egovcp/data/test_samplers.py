@@ -108,7 +108,7 @@ def test_resuming_with_other_data_or_settings_is_refused(
 ) -> None:
     monkeypatch.setattr(index_module, "HELDOUT_FRACTION", 0.5)
     state = InMemorySampler(store, _config()).state_dict()
-    with pytest.raises(UsageError, match="length 6 -> 7"):
+    with pytest.raises(UsageError, match="length 6 -> 7; give the options of the run"):
         InMemorySampler(store, _config(length=7)).load_state_dict(state)
     fewer = EpisodeStore.load([reader], "train")
     with pytest.raises(DataError, match="episodes have changed"):

@@ -1,5 +1,6 @@
 """Encoded episodes, and the folder in which they wait for the commit."""
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,9 @@ def test_remove_invalid_removes_partial_and_damaged_files(
     (whole,) = staging.folder.iterdir()
     (staging.folder / f".{whole.name}.123").write_bytes(b"half")
     (staging.folder / f"000000042-{'0' * 64}.arrow").write_bytes(b"torn by a power cut")
+    (staging.folder / f"000000043-{hashlib.sha256(b'junk').hexdigest()}.arrow").write_bytes(b"junk")
+    assert staging.get(43) is None
+    (staging.folder / f"000000044-{hashlib.sha256(b'junk').hexdigest()}.arrow").write_bytes(b"junk")
     staging.remove_invalid()
     assert staging.numbers() == {41}
     assert list(staging.folder.iterdir()) == [whole]

@@ -27,8 +27,9 @@ def test_a_token_that_the_server_echoes_is_hidden(
 ) -> None:
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
     hub.fail("create", 418, message="who are you, hf_secret?")
-    with pytest.raises(EnvironmentFailure, match="who are you, <token>"):
+    with pytest.raises(EnvironmentFailure, match="who are you, <token>") as caught:
         publish(publication, quick)
+    assert "try again" not in str(caught.value)  # it would be refused again
 
 
 def test_a_missing_file_is_not_a_network_error(tmp_path: Path) -> None:

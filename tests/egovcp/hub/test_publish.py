@@ -265,7 +265,7 @@ def test_ensure_repository_refuses_a_public_one_for_private_data(
     hub: FakeHub, quick: RetryPolicy
 ) -> None:
     ensure_repository(POLICY, quick)
-    with pytest.raises(UsageError, match="is public, but --private was given"):
+    with pytest.raises(UsageError, match="is public, but a private repository was asked for"):
         ensure_repository(replace(POLICY, private=True), quick)
 
 

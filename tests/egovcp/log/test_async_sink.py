@@ -136,6 +136,15 @@ def test_close_times_out_on_a_hanging_disk(
     ]
 
 
+def test_a_file_that_is_not_finished_in_time_is_reported(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
+) -> None:
+    sink = start(FaultySink(tmp_path / "diary", close_s=200.0), close_timeout_s=1.5)
+    sink.write(make_tick(0, bare=True))
+    sink.close()
+    assert warnings == ["the log: not finished within 1.5 s; it is incomplete"]
+
+
 def test_a_full_disk_is_reported_once(
     tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,6 +67,14 @@ def test_write_then_read_is_the_identity(tmp_path: Path, make_tick: Any) -> None
     assert len(recording.ticks) == len(ticks)
     for written, read in zip(ticks, recording.ticks, strict=True):
         assert_same(written, read)
+
+
+def test_names_of_objects_may_hold_separators(tmp_path: Path, make_tick: Any) -> None:
+    tick = make_tick(0)
+    names = ("arm:link, left", "50 % of %2C")
+    scene = [replace(o, name=name) for o, name in zip(tick.scene, names, strict=True)]
+    path = record(tmp_path / "a.mcap", [replace(tick, scene=tuple(scene))])
+    assert tuple(o.name for o in read_recording(path).ticks[0].scene) == names
 
 
 def test_the_row_of_lost_packets_in_older_recordings_is_ignored() -> None:

@@ -57,6 +57,19 @@ def test_the_viewer_listens_on_the_loopback_only(web: LiveRerun, make_tick: Any)
     assert {a.ip for a in listening} == {"127.0.0.1"}
 
 
+def test_an_interrupt_while_the_viewer_starts_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    live, started = LiveRerun("spawn", Viewer(address(free_port()))), list[psutil.Process]()
+
+    def interrupt(self: LiveRerun, ports: list[int]) -> None:
+        started.append(psutil.Process(self.pid))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LiveRerun, "_await", interrupt)
+    with pytest.raises(KeyboardInterrupt), live:
+        pass
+    assert [process.is_running() for process in started] == [False]
+
+
 def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick: Any) -> None:
     warnings: list[str] = []
     sink = connection(web, warnings)

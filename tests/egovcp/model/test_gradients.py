@@ -181,7 +181,7 @@ def test_nothing_of_a_loss_waits_for_a_gpu(name: str) -> None:
             return torch.empty_strided(x.size(), x.stride(), dtype=x.dtype, device="cuda")
 
     drawn = sample_step_noise(model, batch)
-    draws = drawn._replace(noise=on_gpu(drawn.noise))
+    draws = drawn._replace(latent=on_gpu(drawn.latent))
     for part in model.modules():
         for key, parameter in part.named_parameters(recurse=False):
             setattr(part, key, torch.nn.Parameter(on_gpu(parameter), parameter.requires_grad))

@@ -33,7 +33,7 @@ def test_losses_and_gradients_are_those_of_the_cpu(
     batch = random_batch(4, 16)
     draws = sample_step_noise(model, batch)
     expected, gradient = _step(model, batch, draws)
-    draws = draws._replace(noise=draws.noise.cuda(), actions=draws.actions.cuda())
+    draws = draws._replace(latent=draws.latent.cuda(), actions=draws.actions.cuda())
     found, on_gpu = _step(model.cuda(), Batch(*(x.cuda() for x in batch)), draws)
     assert found == pytest.approx(expected, rel=1e-3, abs=1e-4)
     assert on_gpu.shape == gradient.shape

@@ -19,10 +19,10 @@ from egovcp.model.config import LossConfig
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import FloatEvaluator, Int8Evaluator, library, make_evaluator
 from egovcp.plan.backends.integer_network import (
+    HIDDEN_ONE,
     LEAST_SILU,
     NODES,
-    ONE,
-    UNIT,
+    STATE_ONE,
     silu_table,
     tanh_table,
 )
@@ -223,12 +223,12 @@ def test_the_kernel_agrees_across_vector_widths(
     monkeypatch.setattr(library, "FLAGS", (*plain, *vectors))
     cache = kernels / "-".join(("kernel", *vectors))
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    library.library.cache_clear()
+    library.load_kernel.cache_clear()
     try:
         elsewhere = _values(model, config, carry, actions)
         assert len(list(cache.rglob("*.so"))) == 1
     finally:
-        library.library.cache_clear()
+        library.load_kernel.cache_clear()
     error = (here - elsewhere).abs().flatten().sort().values
     assert error[: int(0.97 * len(error))].max() < 0.02 * here.std()
 
@@ -243,12 +243,12 @@ def test_kernel_without_tiles_is_bit_identical(
     carry, actions = _carry(model), _actions()
     tiles = _values(model, config, carry, actions)
     monkeypatch.setattr(library, "request_amx_tiles", lambda: False)
-    library.library.cache_clear()
+    library.load_kernel.cache_clear()
     try:
         vectors = _values(model, config, carry, actions)
-        assert library.layout(library.library()).depth < 64
+        assert library.weight_layout(library.load_kernel()).depth < 64
     finally:
-        library.library.cache_clear()
+        library.load_kernel.cache_clear()
     assert torch.equal(tiles, vectors)
 
 
@@ -310,8 +310,8 @@ def _on_lines(table: Tensor, reach: float, unit: int, a: Tensor) -> Tensor:
 @pytest.mark.parametrize(
     ("function", "table", "reach", "unit", "allowed"),
     [
-        (lambda a: -a * torch.sigmoid(-a), silu_table(), 8.0, UNIT, 1e-3),
-        (torch.tanh, tanh_table(), 4.0, ONE, 3e-4),
+        (lambda a: -a * torch.sigmoid(-a), silu_table(), 8.0, HIDDEN_ONE, 1e-3),
+        (torch.tanh, tanh_table(), 4.0, STATE_ONE, 3e-4),
     ],
     ids=["silu", "tanh"],
 )
@@ -326,4 +326,4 @@ def test_activation_tables_approximate_their_functions(
 def test_byte_offset_of_hidden_layers_is_below_the_minimum_of_silu() -> None:
     x = torch.linspace(-3, 0, 10_001)
     assert torch.nn.functional.silu(x).min() > LEAST_SILU
-    assert silu_table()[0].min() / UNIT > LEAST_SILU
+    assert silu_table()[0].min() / HIDDEN_ONE > LEAST_SILU

@@ -50,7 +50,7 @@ def _motion(m: Gait, state: np.ndarray, height: float = HEIGHT) -> np.ndarray:
 
 def _walking(phase: float, state: np.ndarray, velocity: tuple[float, float] = (0.0, 0.0)) -> Gait:
     m = _start(state)
-    m.phase[:], m.amount[:], m.velocity[:] = phase, 1.0, velocity
+    m.phase[:], m.blend[:], m.velocity[:] = phase, 1.0, velocity
     return m
 
 
@@ -64,18 +64,18 @@ def test_a_robot_without_velocity_command_stands():
     state = _state(3)
     m = _start(state)
     assert not np.any(_run(m, state, 100))
-    assert not m.amount.any()
-    assert not m.turned.any()
+    assert not m.blend.any()
+    assert not m.heading_error.any()
 
 
 def test_it_walks_while_commanded_and_stands_once_the_feet_are_together():
     walk, stand = _state(vx=0.3), _state()
     m = _start(walk)
     _run(m, walk, 50)
-    assert m.amount == 1
+    assert m.blend == 1
     longest = CONFIG.linger + CONFIG.step_time + CONFIG.fade
     stood = _run(m, stand, round(longest * 50) + 2)
-    assert m.amount == 0
+    assert m.blend == 0
     assert sum(int(s[0]) for s in stood) == 1
 
 
@@ -84,7 +84,7 @@ def test_it_begins_to_stand_only_as_a_foot_lands():
     m = _start(state)
     _run(m, state, 50)
     stand = _state()
-    while m.amount == 1:
+    while m.blend == 1:
         before = m.phase.copy()
         _run(m, stand, 1)
     assert before // np.pi != m.phase // np.pi
@@ -127,7 +127,7 @@ def test_a_robot_that_tips_over_steps_at_once():
     state = _state(2)
     m = _start(state)
     _advance(m, state, np.array([[0.05, 0.0], [0.0, 0.4]]))
-    assert (m.amount > 0).tolist() == [False, True]
+    assert (m.blend > 0).tolist() == [False, True]
     assert m.shifting[1] == 0
 
 
@@ -138,7 +138,7 @@ def test_a_robot_that_is_pushed_steps_before_it_tips(velocity):
     m.velocity[1] = velocity
     h = np.full(2, HEIGHT)
     gait.advance(m, stance_table().at(h), h, np.zeros((2, 2)), state, CONFIG)
-    assert (m.amount > 0).tolist() == [False, True]
+    assert (m.blend > 0).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("vy", "left_first"), [(0.2, True), (-0.2, False)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from importlib import resources
 
 import mujoco
 import numpy as np
@@ -32,6 +34,17 @@ def _placed(model: mujoco.MjModel, joints: Array, quaternion: Array) -> mujoco.M
     data.qpos[3:7], data.qpos[7:] = quaternion, joints
     mujoco.mj_forward(model, data)
     return data
+
+
+def test_a_change_of_the_kinematics_needs_a_new_identity_of_the_controllers() -> None:
+    """`egovcp.robot.stance.identity` does not contain them."""
+    table = resources.files("egovcp.robot").joinpath("g1_kinematics.json").read_bytes()
+    bounds = np.concatenate([kinematics.TARGET_LOW, kinematics.TARGET_HIGH]).tobytes()
+    found = [hashlib.sha256(content).hexdigest()[:16] for content in (table, bounds)]
+    assert found == ["c2f65bff3c4866d3", "947d80bb16b54360"], (
+        "the kinematics or the bounds of targets have changed: give the controllers a new "
+        "identity, so that datasets and policies of both are not mixed, then change these hashes"
+    )
 
 
 def test_shipped_table_is_the_models(model: mujoco.MjModel) -> None:

@@ -62,7 +62,7 @@ def test_the_observation_is_the_state_the_clock_the_odometry_and_the_last_action
     clock = seen[0, STATE_DIM : STATE_DIM + 3]
     assert clock[2] == 1
     assert clock[0] ** 2 + clock[1] ** 2 == pytest.approx(1.0)
-    odometry = [*walk.gait.velocity[0], walk.gait.turned[0]]
+    odometry = [*walk.gait.velocity[0], walk.gait.heading_error[0]]
     np.testing.assert_allclose(seen[0, STATE_DIM + 3 : STATE_DIM + 6], odometry, atol=1e-6)
     np.testing.assert_allclose(seen[0, STATE_DIM + 6 :], 0.5)
 
@@ -112,7 +112,7 @@ def test_after_walking_the_filter_starts_anew():
     for _ in range(40):
         walk.observe(moving)
     estimates = []
-    while walk.gait.amount > 0:
+    while walk.gait.blend > 0:
         estimates.append(np.abs(walk._memory.balance.prediction).max())
         walk.observe(still)
     assert np.abs(walk._memory.balance.prediction).max() < 0.1 * estimates[-1]

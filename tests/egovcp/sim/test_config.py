@@ -97,6 +97,12 @@ def test_what_cannot_be_simulated_is_refused_by_name(flag: str, value: str) -> N
         parse_config(Command, [f"--env.{flag}={value}"], "test")
 
 
+def test_an_event_that_may_come_after_the_end_is_refused() -> None:
+    message = r"--env\.wall_episode\.event_ticks=\[20, 60\]: expected less than ticks=15"
+    with pytest.raises(UsageError, match=message):
+        parse_config(Command, ["--env.wall_episode.ticks=15"], "test")
+
+
 def draw(scenario: Scenario, name: str) -> list[float]:
     return scenario.rng(name).random(4).tolist()
 

@@ -17,56 +17,10 @@ from egovcp.packages import MissingPackage
 from egovcp.sim.base_env import Observation
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import Oracle
-from egovcp.sim.robot_env import controller_id_of, make_env
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import build_scene
 from egovcp.sim.tasks import find_task, register_task, task_entries, task_names
-from tests.support.plugins import install
-
-#: A post that is always there; ``{}`` is replaced by the part of a test.
-SOURCE = '''
-import mujoco, numpy as np
-from dataclasses import dataclass
-from egovcp.sim.tasks import *
-
-@dataclass(frozen=True)
-class PostConfig(TaskConfig):
-    """A post."""
-    distance_range: Range = bounded((2.0, 3.0), least=0.5, most=9)
-    """Post before the pelvis, m."""
-
-class PostTask(Task):
-    name = "post"
-    description = "leave a post alone"
-    terms = {"touch": "block"}
-    config: PostConfig = PostConfig()
-    episode = EpisodeConfig(ticks=6, event_ticks=(1, 2), empty_probability=0.5)
-
-    def __init__(self, config, scenario, robot):
-        super().__init__(config, scenario, robot)
-        self.sample("distance")
-
-    @classmethod
-    def add_objects(cls, spec):
-        body = spec.worldbody.add_body(name="post", mocap=True, pos=[20, 0, 1])
-        kind = mujoco.mjtGeom.mjGEOM_CYLINDER
-        body.add_geom(name="post", type=kind, size=[0.1, 1, 0], contype=1, conaffinity=0)
-
-    def place(self):
-        self.robot.data.mocap_pos[-1] = [self.parameters["distance"], 0, 1]
-
-    def rewards(self):
-        return {"touch": 0.25}
-
-    @property
-    def achieved(self):
-        return True
-
-    @property
-    def object_w(self):
-        return self.robot.data.mocap_pos[-1].copy()
-'''
-ENTRY = "post = post_task:PostTask"
+from tests.support.plugins import ENTRY, SOURCE, install
 
 
 @pytest.fixture
@@ -234,6 +188,14 @@ def test_a_defective_task_is_named_with_what_to_do(
     assert "\n" not in str(caught.value)
 
 
+def test_of_two_tasks_in_one_scene_the_one_that_does_not_compile_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed(tmp_path, monkeypatch, "size=[0.1, 1, 0]", "size=[0, 0, 0]")
+    with pytest.raises(EnvironmentFailure, match=r"task post .*: its scene does not compile"):
+        build_scene((find_task("post"), find_task("ball")), "points")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "entry", "message"),
     [
@@ -252,6 +214,8 @@ def test_a_defective_task_is_named_with_what_to_do(
             "its name, 'ball', is that of a task of egovcp ",
         ),
         ('name = "post"', 'name = "camera"', "camera = post_task:PostTask", "cannot be the name"),
+        ('"touch": "block"', '"success": "block"', ENTRY, "'success' cannot be the name of a"),
+        ('"touch": "block"', '"a,b": "block"', ENTRY, "'a,b' cannot be the name of a"),
         ('name = "post"', 'name = "pillar"', ENTRY, "is named 'pillar'; use one name"),
         ("def rewards", "def payment", ENTRY, "the class lacks rewards"),
         (
@@ -290,6 +254,8 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
     assert "post" not in task_names()
     with pytest.raises(UsageError, match=r"unknown task 'post'.*needs that package"):
         find_task("post")
+    with pytest.raises(UsageError, match="give it by the flag --task=post_task:PostTask"):
+        find_task("post_task:PostTask")
     assert register_task("post_task:PostTask") == "post" == register_task("post_task:PostTask")
     assert find_task("post").description == "leave a post alone"
     command = EntryPoint("egovcp-collect", "egovcp_collect.collect")
@@ -339,60 +305,6 @@ def test_a_defective_oracle_is_named(
         Oracle().act(env)
 
 
-def test_a_task_of_another_robot_needs_its_class(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = """
-from egovcp.sim.tasks import MujocoRobot, RobotTask
-
-class Robot(MujocoRobot):
-    control_id = "x"
-
-class Reach(RobotTask):
-    name, description, terms = "reach", "reach", {}
-    robot_class = Robot
-    def add_objects(spec): ...
-    place = rewards = object_w = achieved = None
-
-class Nobody(Reach):
-    name = "nobody"
-    robot_class = None
-
-class Text(Reach):
-    name = "text"
-    robot_class = "robot"
-"""
-    (tmp_path / "robot_tasks.py").write_text(source)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(UsageError, match=r"lacks robot_class\.build, .*\.state, .*\.spec"):
-        register_task("robot_tasks:Reach")
-    with pytest.raises(UsageError, match="lacks robot_class;"):
-        register_task("robot_tasks:Nobody")
-    with pytest.raises(UsageError, match="robot_class is 'robot', expected a subclass of MujocoR"):
-        register_task("robot_tasks:Text")
-
-
-def test_a_task_of_another_robot_must_be_a_robot_task(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    source = """
-from dataclasses import replace
-from egovcp.robot_spec import G1
-from post_task import PostTask
-
-class ArmTask(PostTask):
-    name = "arm"
-    @classmethod
-    def robot_spec(cls):
-        return replace(G1, robot_type="arm")
-"""
-    (tmp_path / "post_task.py").write_text(SOURCE)
-    (tmp_path / "arm_tasks.py").write_text(source)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(UsageError, match="its robot is not the G1; derive it from"):
-        register_task("arm_tasks:ArmTask")
-
-
 def test_a_reference_without_the_simulator_names_the_package(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -421,30 +333,3 @@ def test_objects_with_names_like_parts_of_the_robot_are_none(
     (post,) = index.objects["post"]
     assert index.part[post] == -1
     assert post not in index.foot_geoms
-
-
-def test_robots_of_equal_specification_and_other_classes_are_not_mixed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their low-level control differs."""
-    source = """
-from arm_task import PlanarArm, ReachTask
-
-class OtherArm(PlanarArm):
-    control_id = "other"
-
-class OtherTask(ReachTask):
-    name = "other_reach"
-    robot_class = OtherArm
-"""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "examples" / "robots" / "arm"))
-    install(tmp_path, "other", source, "other_reach = other_task:OtherTask", monkeypatch)
-    register_task("arm_task:ReachTask")
-    tasks = ("arm_reach", "other_reach")
-    config = sim_config.EnvConfig()
-    message = "robot_class of task other_reach is OtherArm, expected PlanarArm"
-    with pytest.raises(UsageError, match=message):
-        controller_id_of(config, tasks)
-    env = make_env(config, 2, tasks[:1])
-    with pytest.raises(UsageError, match=message):
-        env.reset([Scenario(task, 0, 0) for task in tasks])

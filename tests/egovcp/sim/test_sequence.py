@@ -153,7 +153,7 @@ def test_the_last_part_ends_as_the_others_do(sequences: EnvConfig) -> None:
     assert len(present) < task.ticks_limit
 
     walls = replace(sequences, sequence=SequenceConfig(("ball", "wall"), pause_ticks=12))
-    env, task = begun(replace(walls, wall_episode=EpisodeConfig(ticks=9, event_ticks=(20, 20))))
+    env, task = begun(replace(walls, wall_episode=EpisodeConfig(ticks=9, event_ticks=(8, 8))))
     names = []
     while not env.done[0]:
         env.step(HOLD)

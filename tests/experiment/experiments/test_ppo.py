@@ -64,11 +64,7 @@ def test_transitions_are_whole_updates_equally_far_apart() -> None:
     assert PpoBaselineConfig(steps=0).transitions == ()
 
 
-def test_flags_that_change_which_policies_are_saved_are_refused() -> None:
-    for flag in ("--steps=5", "--robots=2", "--save_freq=1"):
-        ppo = replace(CONFIG.ppo, flags=(flag,))
-        with pytest.raises(UsageError, match=flag):
-            replace(CONFIG, ppo=ppo).check()
+def test_the_report_needs_a_training() -> None:
     with pytest.raises(UsageError, match=r"--ppo\.steps=0"):
         PPO.cells(replace(CONFIG, ppo=PpoBaselineConfig(steps=0)))
 
@@ -108,12 +104,12 @@ def played(name: str, success: int, reward: float) -> Mapping[str, Any]:
 
 def results() -> dict[str, Mapping[str, Any]]:
     return {
-        "collect-ball-5400": {"figures": {"episodes": 5400, "steps": 200_100}},
-        "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
-        "play-ball-ppo_500-s3": {"figures": {"ball": played("ppo", 5, 0.2)}},
-        "play-ball-ppo_1000-s3": {"figures": {"ball": played("ppo", 10, 0.2)}},
+        "collect-ball-5400": {"metrics": {"episodes": 5400, "steps": 200_100}},
+        "play-ball-default-s3": {"metrics": {"ball": played("planner", 18, 1.0)}},
+        "play-ball-ppo_500-s3": {"metrics": {"ball": played("ppo", 5, 0.2)}},
+        "play-ball-ppo_1000-s3": {"metrics": {"ball": played("ppo", 10, 0.2)}},
         "bounds-ball": {
-            "figures": {
+            "metrics": {
                 "ball": {
                     **played("hold", 2, 0.1),
                     **played("random", 2, 0.0),
@@ -135,7 +131,7 @@ def test_conclusions_follow_from_the_scores() -> None:
         "ball: by reward, the last policy of PPO is better compared with the neutral pose and "
         "no different beyond chance compared with its first policy."
     ]
-    assert found.figures["ball"]["planner_transitions"] == 200_100
+    assert found.metrics["ball"]["planner_transitions"] == 200_100
 
 
 def test_the_transitions_of_a_given_dataset_are_counted(tmp_path: Path) -> None:
@@ -143,11 +139,11 @@ def test_the_transitions_of_a_given_dataset_are_counted(tmp_path: Path) -> None:
     write_json(tmp_path / "meta" / "info.json", {"total_episodes": 40, "total_frames": 3210})
     config = replace(CONFIG, data=DataConfig(roots={"ball": str(tmp_path)}))
     found = PPO.report(config, results())
-    assert found.figures["ball"]["planner_transitions"] == 3210
+    assert found.metrics["ball"]["planner_transitions"] == 3210
 
 
 def test_the_transitions_of_a_given_policy_are_unknown() -> None:
     config = replace(CONFIG, train=replace(CONFIG.train, policies={"ball": "a/ball"}))
     found = PPO.report(config, results())
-    assert "planner_transitions" not in found.figures["ball"]
+    assert "planner_transitions" not in found.metrics["ball"]
     assert len(found.lead) == 3

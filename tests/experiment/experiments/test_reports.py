@@ -15,9 +15,7 @@ from egovcp_experiment.cell import ARTIFACT, COLLECT, PLAY, Cell, CellOutput
 from egovcp_experiment.config import SCALES
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.experiments.generalise import _EDGES, conditions
-from egovcp_experiment.experiments.interpret import _edges
 from egovcp_experiment.report import ExperimentReport, Plot, Table
-from egovcp_experiment.studies.open_loop import HORIZONS
 from egovcp_experiment.studies.plan_time import SEARCHES
 from egovcp_experiment.studies.residuals import analysis
 
@@ -61,8 +59,8 @@ def records(name: str, share: float) -> dict[str, Mapping[str, Any]]:
     """Results of the first ``share`` of the plays, and of all collections."""
     cells = EXPERIMENTS[name].cells(SCALES["small"]())
     plays = [cell for cell in cells if cell.command is PLAY]
-    found = {cell.name: {"figures": played(cell)} for cell in plays[: round(share * len(plays))]}
-    collected = {"figures": {"episodes": 100, "steps": 15_000}}
+    found = {cell.name: {"metrics": played(cell)} for cell in plays[: round(share * len(plays))]}
+    collected = {"metrics": {"episodes": 100, "steps": 15_000}}
     return {**{c.name: collected for c in cells if c.command is COLLECT}, **found}
 
 
@@ -102,10 +100,10 @@ def test_every_task_has_a_conclusion(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["generalise", "planners"])
-def test_pages_begin_with_three_sentences_and_a_figure(name: str) -> None:
+def test_pages_begin_with_three_sentences_and_a_plot(name: str) -> None:
     found = report(name, 1.0)
     assert len(found.lead) == 3
-    assert found.figure is not None
+    assert found.plot is not None
 
 
 @pytest.mark.parametrize("lost", [0, 6, 60])
@@ -114,7 +112,7 @@ def test_a_verdict_needs_the_whole_interval_on_one_side_of_the_bar(lost: int) ->
     found = records("generalise", 1.0)
     for cell in EXPERIMENTS["generalise"].cells(SCALES["small"]()):
         if cell.command is PLAY and cell.flags["controllers"] == "planner":
-            row = found[cell.name]["figures"][cell.flags["task"]]["planner"]["played"]
+            row = found[cell.name]["metrics"][cell.flags["task"]]["planner"]["played"]
             failures = lost if "thickest" in cell.name else 0
             scenes = range(120)
             row |= {"episode": [*scenes], "steps": [100] * 120, "reward": [1.0] * 120}
@@ -224,7 +222,7 @@ def test_variance_compares_single_terms_with_the_planner() -> None:
         success = [k < successes for k in range(20)]
         return {"reward": [10 * reward] * 20, "steps": [10] * 20, "success": success}
 
-    figures = {
+    metrics = {
         "task": "ball",
         "horizon": 4,
         "terms": {"first": term(0.1, 9), "last": term(0.3, 20)},
@@ -233,11 +231,11 @@ def test_variance_compares_single_terms_with_the_planner() -> None:
     }
     cells = {c.name: c for c in EXPERIMENTS["variance"].cells(SCALES["small"]())}
     found = {
-        "plan_terms-ball": {"figures": figures},
-        **{name: {"figures": played(cells[name])} for name in _HORIZON_CELLS},
+        "plan_terms-ball": {"metrics": metrics},
+        **{name: {"metrics": played(cells[name])} for name in _HORIZON_CELLS},
     }
     for name, played_term in zip(_HORIZON_CELLS, (term(0.05, 8), term(0.2, 18)), strict=True):
-        row = found[name]["figures"]["ball"]["planner"]["played"]
+        row = found[name]["metrics"]["ball"]["planner"]["played"]
         row |= played_term
     assert cells["plan_terms-ball"].flags["seed"] == cells[_HORIZON_CELLS[0]].flags["seed"]
     made = EXPERIMENTS["variance"].report(SCALES["small"](), found)
@@ -247,7 +245,7 @@ def test_variance_compares_single_terms_with_the_planner() -> None:
         "ball: compared with the planner (90.0 %), by reward: one step worse (40.0 %), first term "
         "worse (45.0 %), last term better (100.0 %)"
     )
-    assert made.figures["ball"]["terms"]["last term"]["success_rate"] == 1.0
+    assert made.metrics["ball"]["terms"]["last term"]["success_rate"] == 1.0
     alone = EXPERIMENTS["variance"].report(
         SCALES["small"](), {"plan_terms-ball": found["plan_terms-ball"]}
     )
@@ -259,9 +257,9 @@ def test_variance_compares_its_prediction_with_the_same_model_in_closed_loop() -
     errors = np.random.default_rng(0).normal(size=(100, 6))  # independent
     returns = np.zeros((100, 6, 2))
     plans = {"planner": analysis(errors, returns, returns)}
-    found["residuals-ball"] = {"figures": {"plans": plans}}
+    found["residuals-ball"] = {"metrics": {"plans": plans}}
     for name, reward in (("ours_mc_n1", 0.1), ("ours_mc", 0.2)):
-        row = found[f"play-ball-{name}-s0"]["figures"]["ball"]["planner"]["played"]
+        row = found[f"play-ball-{name}-s0"]["metrics"]["ball"]["planner"]["played"]
         row["reward"] = [10 * reward] * 20
     cells = {c.name: c for c in EXPERIMENTS["variance"].cells(SCALES["small"]())}
     model = CellOutput("train-all-mc-s0", ARTIFACT)
@@ -279,106 +277,9 @@ def test_a_share_of_no_variance_is_a_dash() -> None:
     errors[:, 0] = 0.0
     returns = np.random.default_rng(1).normal(size=(50, 6, 4))
     plans = {"planner": analysis(errors + returns.mean(2), returns, returns)}
-    found = {"residuals-ball": {"figures": {"plans": plans}}}
+    found = {"residuals-ball": {"metrics": {"plans": plans}}}
     made = EXPERIMENTS["variance"].report(SCALES["small"](), found)
     assert made.lead[0].endswith("), -.")
-
-
-@pytest.mark.parametrize(
-    ("empty", "after", "words"),
-    [
-        ((0.02, 0.04), (0.05, 0.09), "raised for the ball"),
-        ((0.02, 0.04), (0.03, 0.09), "not raised"),
-        ((0.25, 0.30), (0.40, 0.50), "raised in empty scenes, too"),
-    ],
-)
-def test_intervals_decide_whether_hands_are_raised(
-    empty: tuple[float, float], after: tuple[float, float], words: str
-) -> None:
-    figures: dict[str, Any] = {
-        name: {"mean": sum(ci95) / 2, "ci95": list(ci95), "episodes": 20}
-        for name, ci95 in (("empty_scene", empty), ("after_throw", after))
-    }
-    found = EXPERIMENTS["interpret"].report(
-        SCALES["small"](), {"behaviour-ball": {"figures": figures}}
-    )
-    (line,) = found.lead
-    assert line.endswith(f"after a throw ({words}).")
-
-
-def test_bracing_is_compared_with_the_autoregressive_model() -> None:
-    def figures(contact: float, gain: float) -> Mapping[str, Any]:
-        def row(name: str, value: float) -> Mapping[str, Any]:
-            return {name: value, "ci95": [value - 0.01, value + 0.01], "episodes": 20}
-
-        shares = ("undisturbed_without_contact", "hands_back")
-        return {
-            **{name: row("share", 0.9) for name in shares},
-            "hand_contact": row("share", contact),
-            "contact_s": row("mean", 0.4),
-            "bracing_q": row("mean", gain),
-            "bracing_j": row("mean", gain - 0.1),
-        }
-
-    config = SCALES["small"]()
-    cells = {c.name: c for c in EXPERIMENTS["interpret"].cells(config)}
-    arwm = cells["behaviour-wall-arwm"].flags
-    assert arwm["policy.path"] == CellOutput("train-all-arwm-s0", ARTIFACT)
-    assert {**cells["behaviour-wall"].flags, "policy.path": arwm["policy.path"]} == arwm
-    found = {
-        "behaviour-wall": {"figures": figures(0.98, 0.5)},
-        "behaviour-wall-arwm": {"figures": figures(0.1, -0.5)},
-    }
-    made = EXPERIMENTS["interpret"].report(config, found)
-    assert len(made.lead) == 1
-    ours, other = made.findings
-    assert ours.startswith("wall: a hand touches the wall after 98.0 % of the pushes; Q prefers ")
-    assert "+0.40 with the costs" in ours
-    assert other.startswith("wall, ARWM: a hand touches the wall after 10.0 %")
-    assert "Q does not prefer " in other
-    given = replace(config, train=replace(config.train, policies={"all": "contact"}))
-    assert "behaviour-wall-arwm" not in {c.name for c in EXPERIMENTS["interpret"].cells(given)}
-
-
-def test_open_loop_errors_of_all_pixels_lead() -> None:
-    row = {"model": 0.1, "repeat": 0.2, "model_moving": 0.3, "repeat_moving": 0.9}
-    image = np.ones((len(HORIZONS), 2, 2)).tolist()
-    strips = [{"seen": image, "imagined": image}]
-    figures = {"episodes": 3, "errors_m": {str(k): row for k in HORIZONS}, "strips": strips}
-    found = {f"open_loop-{task}": {"figures": figures} for task in ("ball", "arch")}
-    made = EXPERIMENTS["interpret"].report(SCALES["small"](), found)
-    assert made.lead[0].endswith("is 10.0 cm of ball (20.0 cm), 10.0 cm of arch (20.0 cm).")
-    assert made.figure is not None
-    assert made.figure.name == "open-loop-ball"
-    assert [part.name for part in made.sections if isinstance(part, Plot)] == ["open-loop-arch"]
-
-
-def test_a_value_map_has_a_frame_around_what_can_be_reached() -> None:
-    shown = {
-        "moment": "before",
-        "tick": 3,
-        "hand": "left",
-        "best": (0.2, 0.1),
-        "reach": ([0.1, 0.3], [0.0, 0.2]),
-        "values": [[0.0, 1.0], [2.0, 3.0]],
-    }
-    summary = {"episodes": 2, "spread": 0.5, "height_error_m": 0.1}
-    figures = {
-        "summary": {"before": summary, "75%": summary},
-        "x": [0.0, 0.4],
-        "z": [0.0, 0.4],
-        "aim": [0.1, 0.3],
-        "maps": [shown],
-    }
-    found = {"value_maps-ball": {"figures": figures}}
-    made = EXPERIMENTS["interpret"].report(SCALES["small"](), found)
-    assert made.figure is not None
-    assert "what the rate limit can reach" in made.figure.caption
-    assert len(made.lead) == 1
-
-
-def test_the_cells_of_a_value_map_are_around_their_centres() -> None:
-    assert _edges([0.0, 0.5, 1.0]) == (-0.25, 1.25)
 
 
 def test_ablations_name_the_best_choice() -> None:
@@ -391,7 +292,7 @@ def test_ablations_name_the_best_choice() -> None:
             "value": {"r2": 0.3, "slope": 1.0},
             "latent": {"active": 20, "kl_nats": 3.0},
         }
-        return {"figures": {"tasks": {"ball": heldout}}}
+        return {"metrics": {"tasks": {"ball": heldout}}}
 
     config = replace(SCALES["small"](), tasks=("ball",))
     config = replace(config, train=replace(config.train, seeds=(0, 1)))
@@ -404,18 +305,21 @@ def test_ablations_name_the_best_choice() -> None:
     words = "`value_two_hot` is best with 5; `default` has 3, place 2 of 2."
     assert made.lead == [f"ball, moving, 8 (x): {words}"]
     assert made.findings == [f"ball, all pixels, 8 (x): {words}"]
-    assert made.figure is not None
+    assert made.plot is not None
     (table,) = (part for part in made.sections if isinstance(part, Table))
     rows = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
     assert rows["default"]["Q R2"] == "0.3 ± 0"
     assert rows["default"]["moving, 8 (x)"] == "3 ± 1"
     assert rows["value_two_hot"]["AUC within 5"] == "-"
+    of_all = {name.replace("-ball-", "-all-"): record for name, record in found.items()}
+    both = EXPERIMENTS["ablations"].report(replace(config, tasks=("ball", "wall")), of_all)
+    assert both.findings[-1] == "wall: no episode is held out, because its data has too few."
 
 
 def test_searches_above_the_time_budget_are_named() -> None:
     row = {"samples": 32, "iterations": 3, "elites": 16, "plan_ms": 5.0, "within_budget": True}
     slow = {"cem_6": {**row, "plan_ms": 15.2, "within_budget": False}}
-    timing = {"figures": {"searches": dict.fromkeys(SEARCHES, row) | slow}}
+    timing = {"metrics": {"searches": dict.fromkeys(SEARCHES, row) | slow}}
     found = {**records("planners", 1.0), "plan_time-ball": timing}
     findings = EXPERIMENTS["planners"].report(SCALES["small"](), found).findings
     over = [line for line in findings if "fewest candidates" in line]

@@ -48,7 +48,7 @@ def played(reward: float, success: float) -> Mapping[str, Any]:
         "reward": (10 * reward + rng.normal(0, 0.1, COUNT)).tolist(),
         "success": [k < success * COUNT for k in range(COUNT)],
     }
-    return {"figures": {"wall": {"planner": {"played": result, "plan_ms_p50": 1.0}}}}
+    return {"metrics": {"wall": {"planner": {"played": result, "plan_ms_p50": 1.0}}}}
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,8 @@ def test_the_default_model_is_played_as_it_was_during_its_training() -> None:
         "Success with more gradient steps: 20.0 % (1000 steps) to 80.0 % (3000 steps) on wall.",
         "By reward, the model with most gradient steps is better on wall than the first.",
     ]
-    assert page.figure is not None
-    assert "gradient steps" in page.figure.svg
+    assert page.plot is not None
+    assert "gradient steps" in page.plot.svg
     given = replace(CONFIG, train=TrainingConfig(seeds=(0,), policies={"wall": "a/wall"}))
     assert not [name for name in plays(given) if "step_" in name]
     flags = ("--save_freq=2000",)
@@ -131,5 +131,6 @@ def test_parts_are_those_of_a_given_dataset(tmp_path: Path) -> None:
     rates = "50.0 % (40k transitions) to 50.0 % (80k transitions)"
     assert line == f"Success with more data: {rates} on wall."
     more = replace(config, data=replace(config.data, parts=(1.0, 2.0)))
-    with pytest.raises(UsageError, match=r"give --data\.parts=\[1\.0\]"):
-        SCALING.cells(more)
+    for config in (more, replace(more, data=replace(more.data, parts=(2.0,)))):
+        with pytest.raises(UsageError, match=r"give --data\.parts=\[1\.0\]"):
+            SCALING.cells(config)

@@ -23,7 +23,7 @@ def track(reach: list[float], speed: list[float]) -> BehaviourTrace:
 
 
 def test_the_further_hand_counts() -> None:
-    np.testing.assert_allclose(track([0.0, 0.4], [0, 0]).hands_away, [0.0, 0.4])
+    np.testing.assert_allclose(track([0.0, 0.4], [0, 0]).hand_distance_m, [0.0, 0.4])
 
 
 def test_hands_that_return_after_recovery_are_back() -> None:
@@ -47,7 +47,7 @@ def test_episodes_without_recovery_are_not_judged() -> None:
 
 def test_the_time_to_contact_counts_from_the_push() -> None:
     trace = track([0.0] * 5, [0.0] * 5)
-    assert trace.since[0] < 0
+    assert trace.since_event_s[0] < 0
     trace.hands_on = [True, False, False, True, True]
     assert trace.contact_s == pytest.approx(3 * TICK)  # to the end of the third tick
     trace.hands_on = [True, *[False] * 4]
@@ -82,7 +82,7 @@ def test_planner_options_change_the_planner(
     argv = ["--task=ball", *flags, "--planner.samples=3", "--planner.elites=2"]
     assert main(argv) == 0
     assert main([*argv, "--planner.samples=1", f"--output_dir={tmp_path / 'two'}"]) == 2
-    assert "elites (2) exceed samples (1)" in capsys.readouterr().err
+    assert "planner.elites=2 exceeds planner.samples=1; lower it" in capsys.readouterr().err
 
 
 def test_an_artifact_of_another_controller_is_refused(

@@ -44,6 +44,11 @@ def test_neighbours_are_from_other_episodes() -> None:
     assert found["tick_r2"] < 0.5
 
 
+def test_no_task_is_refused(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*flags, "--tasks=[]"]) == 2
+    assert "--tasks=[]: expected at least one task" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_every_task_is_in_the_maps(flags: list[str], tmp_path: Path) -> None:
     assert main([*flags, "--tasks=[ball,wall]", "--points=40"]) == 0

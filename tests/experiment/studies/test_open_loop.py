@@ -32,8 +32,8 @@ def test_empty_predictions_count_as_the_end_of_the_range() -> None:
     assert open_loop._errors(model, truth, last, max_m=5.0) == {
         "model": pytest.approx((0.5 + 0 + 1) / 3),
         "repeat": pytest.approx((0 + 1 + 1) / 3),
-        "model_moving": pytest.approx((0 + 1) / 2),
-        "repeat_moving": pytest.approx((1 + 1) / 2),
+        "model_changed": pytest.approx((0 + 1) / 2),
+        "repeat_changed": pytest.approx((1 + 1) / 2),
     }
 
 

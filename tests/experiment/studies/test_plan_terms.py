@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from egovcp.artifact import load_artifact, save_artifact
+from egovcp.artifact import Artifact, load_artifact, save_artifact
 from egovcp.model import PRESETS
 from egovcp.plan import PlannerConfig, ReferenceEvaluator
 from egovcp.robot.controllers import WALK, make_controller
@@ -18,6 +18,7 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import HELD_OUT, Scenario
 from egovcp.testing import toy_model
 from egovcp_experiment.cell import read_json
+from egovcp_experiment.studies import plan_terms
 from egovcp_experiment.studies.plan_terms import TERMS, TermPolicy, main, term_evaluator
 
 
@@ -50,14 +51,19 @@ def test_a_policy_of_a_term_plans_by_it(policy: Path) -> None:
 def test_all_terms_play_the_scenarios_of_evaluations(
     flags: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seeds = []
-    reset = VectorEnv.reset
+    seeds, sent = [], list[torch.Tensor]()
+    reset, random_plans = VectorEnv.reset, plan_terms._random_plans
 
     def recorded(env: VectorEnv, scenarios: Sequence[Scenario]) -> Observation:
         seeds.extend(scenario.seed for scenario in scenarios)
         return reset(env, scenarios)
 
+    def planned(artifact: Artifact, last: torch.Tensor, rng: torch.Generator) -> torch.Tensor:
+        sent.append(last)
+        return random_plans(artifact, last, rng)
+
     monkeypatch.setattr(VectorEnv, "reset", recorded)
+    monkeypatch.setattr(plan_terms, "_random_plans", planned)
     assert main([*flags, "--task=ball", "--seed=3"]) == 0
     assert seeds == [HELD_OUT + 3] * 4
     found = read_json(tmp_path / "out" / "result.json")
@@ -65,6 +71,8 @@ def test_all_terms_play_the_scenarios_of_evaluations(
     assert [row["steps"] for row in found["terms"].values()] == [[32, 32]] * 2
     assert found["horizon"] == len(found["spread"]) == 2
     assert all(value > 0 for value in found["spread"])
+    assert not sent[0].any()  # plans begin at the action before the observation
+    assert sent[1].any()
 
 
 def test_another_objective_is_refused(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.plan import PlannerConfig, Policy
+from egovcp.robot_spec import G1
+from egovcp.testing import toy_model
 from egovcp_experiment.cell import read_json
 from egovcp_experiment.studies import plan_time
 
@@ -35,6 +38,13 @@ def test_candidates_follow_from_two_times(
 def test_times_that_do_not_grow_are_refused() -> None:
     with pytest.raises(EnvironmentFailure, match="timing too noisy"):
         plan_time._affordable(PlannerConfig(), "cem", 10.0, 10.0, 40.0)
+
+
+def test_searches_of_another_robot_are_timed() -> None:
+    robot = replace(G1, robot_type="arm", depth=(32, 48), depth_max_m=1.5)
+    planner = PlannerConfig(samples=16, elites=4, iterations=1)
+    times = plan_time._median_times({"cem": Policy(toy_model(robot=robot), planner, 1)}, rounds=1)
+    assert times["cem"] > 0
 
 
 def test_every_search_is_timed_and_can_be_played(

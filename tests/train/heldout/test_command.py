@@ -120,7 +120,6 @@ def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Pat
         ("--policy.path=/nowhere", 4, "no such folder: '/nowhere'"),
         ("--dataset.root=/nowhere", 3, "/nowhere"),
         ("--device=tpu9", 2, "unknown --device"),
-        ("--return_steps=12", 2, "--return_steps was removed"),
     ],
 )
 def test_refusals(

@@ -17,12 +17,12 @@ from egovcp_train.heldout.open_loop import (
     HORIZONS,
     MAX_STRIPS,
     REGIONS,
-    STRIP,
+    STRIP_HORIZONS,
+    ImageStrip,
     OpenLoop,
-    Strip,
     _regions,
-    strips,
-    top_strips,
+    image_strips,
+    select_strips,
 )
 from egovcp_train.heldout.pictures import calibration_picture, strip_picture
 from egovcp_train.heldout.report import Values
@@ -175,11 +175,11 @@ def test_groups_add_up() -> None:
 
 
 # --- image strips --------------------------------------------------------------------
-def _strips(batch: Batch) -> list[Strip]:
+def _strips(batch: Batch) -> list[ImageStrip]:
     model = toy_model()
     with torch.no_grad():
         rollout = filter_sequence(model, batch)
-        return strips(model, batch, rollout)
+        return image_strips(model, batch, rollout)
 
 
 def _still(length: int = 40) -> Batch:
@@ -192,10 +192,10 @@ def test_a_strip_starts_before_what_moves() -> None:
     batch.depth[3, 25:28] = 1000  # a change into row 25, and one into row 28
     (first, *_) = _strips(batch)
     assert max(CONTEXT - 1, 28 - max(HORIZONS)) <= first.start < 25
-    seen = first.observed[[k + first.start in (25, 26, 27) for k in STRIP]]
+    seen = first.observed[[k + first.start in (25, 26, 27) for k in STRIP_HORIZONS]]
     assert len(seen) > 0
     assert np.allclose(seen, 0.8)
-    assert first.predicted.shape == (len(STRIP), spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    assert first.predicted.shape == (len(STRIP_HORIZONS), spec.DEPTH_ROWS, spec.DEPTH_COLS)
 
 
 def test_the_first_picture_is_filtered_and_the_others_are_imagined() -> None:
@@ -220,7 +220,8 @@ def test_episodes_too_short_for_a_strip_have_none(length: int) -> None:
 
 
 def test_few_strips_are_kept() -> None:
-    found = top_strips([s._replace(moving_pixels=i) for i, s in enumerate(_strips(_still()) * 3)])
+    many = [s._replace(moving_pixels=i) for i, s in enumerate(_strips(_still()) * 3)]
+    found = select_strips(many)
     assert [s.moving_pixels for s in found] == [8, 7, 6]
     assert len(found) == MAX_STRIPS
 

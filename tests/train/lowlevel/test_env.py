@@ -63,7 +63,7 @@ def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
         for row in torch.nonzero(done):
             assert float(reward[row]) < -1
             assert int(env.episode_length_buf[row]) == 0
-            assert env.logic.walk.gait.amount[row] == 0
+            assert env.logic.walk.gait.blend[row] == 0
             assert not extras["time_outs"][row]
         fell += int(done.sum())
     assert fell >= 8
@@ -170,7 +170,7 @@ def test_a_standing_robot_that_is_pushed_at_a_wall_braces_on_it_and_lets_go():
 def test_steps_cost_nothing_for_a_while_after_a_push():
     env = _env(2, commands=STANDING, disturbances=PLAIN)
     env.step(_zero(env))
-    env.logic.walk.gait.amount[:] = 1.0
+    env.logic.walk.gait.blend[:] = 1.0
     env.logic.pushed(np.array([1]))
     terms = env.logic.reward_terms(env.physics.snapshot())
     assert terms["stepping"].tolist() == [1.0, 0.0]

@@ -161,7 +161,7 @@ def test_it_writes_a_line_per_skill(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setenv("HOME", str(tmp_path))
-    flags = ["--output_dir=~/out", "--skills=squat", "--episodes=2", "--threads=1"]
+    flags = ["--output_dir=~/out", "--skills=squat, squat", "--episodes=2", "--threads=1"]
     assert main(flags) == 0
     figures = json.loads((tmp_path / "out" / "lowlevel.json").read_text())
     assert figures["squat"]["episodes"] == 2
@@ -176,7 +176,8 @@ def test_it_writes_a_line_per_skill(
     hottest = max(torques, key=torques.get)
     assert 0.02 < torques[hottest] < 0.5
     assert figures["_run"]["controller"] == make_controller("walk").id
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "2/2" in err  # each skill once
     assert "squat" in out
     assert hottest.removesuffix("_joint").removeprefix("left_").removeprefix("right_") in out
     rows = out[out.index("skill") : out.index("metrics:")].splitlines()

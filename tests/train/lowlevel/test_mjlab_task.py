@@ -61,7 +61,7 @@ def test_mjlabs_command_line_reaches_every_number(task_module):
     from mjlab import TYRO_FLAGS
     from mjlab.scripts.train import TrainConfig
 
-    flags = ["--env.scene.num-envs", "7", "--env.commands.loop.walk.action-scale", "0.2"]
+    flags = ["--env.scene.num-envs", "7", "--env.commands.task-logic.walk.action-scale", "0.2"]
     config = tyro.cli(
         TrainConfig,
         args=[*flags, "--agent.algorithm.desired-kl", "0.03"],
@@ -69,7 +69,7 @@ def test_mjlabs_command_line_reaches_every_number(task_module):
         config=TYRO_FLAGS,
     )
     assert config.env.scene.num_envs == 7
-    assert config.env.commands["loop"].walk.action_scale == 0.2
+    assert config.env.commands["task_logic"].walk.action_scale == 0.2
     assert config.agent.algorithm.desired_kl == 0.03
 
 

@@ -1,4 +1,4 @@
-"""The simulator as PPO sees it, and PPO: episodes, pictures, time limits, and that it learns."""
+"""The simulator as PPO sees it, and PPO: episodes, images, time limits, and that it learns."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,7 +25,8 @@ type Build = Callable[..., ContactEnv]
 
 class _Fake:
     """Episodes of ``LIMIT`` ticks that end in a fall after two where the episode is number 1; a
-    picture is as far away, in m, as ticks have passed, plus 1; a reward is the first coordinate."""
+    depth image is as far away, in m, as ticks have passed, plus 1; a reward is the first
+    coordinate."""
 
     controller = SimpleNamespace(id="fake")
 
@@ -118,7 +119,7 @@ def test_a_time_limit_is_no_failure(build: Build) -> None:
     assert ends[3] == ([1.0, 0.0], [True, False])
 
 
-def test_pictures_of_an_episode_never_reach_into_the_next(build: Build) -> None:
+def test_images_of_an_episode_never_reach_into_the_next(build: Build) -> None:
     env = build()
     _step(env)
     obs, *_ = _step(env)

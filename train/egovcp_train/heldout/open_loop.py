@@ -26,8 +26,8 @@ from egovcp.robot_spec import G1, RobotSpec
 HORIZONS: Final = (1, 2, 4, 8, 12, 16)
 CONTEXT: Final = 4  # frames that are filtered before a prediction
 REGIONS: Final = ("valid", "near", "moving")
-NEAR_M: Final = 1.5  # m; upper end of the region "near", about the reach of the hands
-STRIP: Final = tuple(range(0, max(HORIZONS) + 1, 2))  # horizons of an image strip; 0 is filtered
+NEAR_M: Final = 1.5  # m; upper end of the region "near"
+STRIP_HORIZONS: Final = tuple(range(0, max(HORIZONS) + 1, 2))  # of an image strip; 0 is filtered
 MAX_STRIPS: Final = 3  # per task
 _MOVING: Final = 0.04  # change of nearness, 0.2 m of 5 m, as in the loss
 _IMAGES_AT_ONCE: Final = 1024
@@ -126,7 +126,7 @@ def _rows(carry: Carry, *index: Tensor) -> Carry:
 
 
 def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
-    """(B, T, 48, 64) bool each."""
+    """(B, T, H, W) bool each."""
     valid = near > 0
     return {
         "valid": valid,
@@ -135,7 +135,7 @@ def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
     }
 
 
-class Strip(NamedTuple):
+class ImageStrip(NamedTuple):
     """Recorded and predicted images of one prediction."""
 
     moving_pixels: float
@@ -143,17 +143,17 @@ class Strip(NamedTuple):
     start: int
     """Row of the last observed image."""
     observed: NDArray[np.float32]
-    """(len(STRIP), 48, 64) nearness."""
+    """(len(STRIP_HORIZONS), H, W) nearness."""
     predicted: NDArray[np.float32]
-    """(len(STRIP), 48, 64) nearness."""
+    """(len(STRIP_HORIZONS), H, W) nearness."""
 
 
-def top_strips(found: Sequence[Strip]) -> list[Strip]:
+def select_strips(strips: Sequence[ImageStrip]) -> list[ImageStrip]:
     """The `MAX_STRIPS` strips with the most moving pixels."""
-    return sorted(found, key=lambda strip: -strip.moving_pixels)[:MAX_STRIPS]
+    return sorted(strips, key=lambda strip: -strip.moving_pixels)[:MAX_STRIPS]
 
 
-def strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[Strip]:
+def image_strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[ImageStrip]:
     """Strips of the episodes in which most pixels move, at most one per episode.
 
     A strip starts before the rows in which most pixels move.
@@ -176,11 +176,11 @@ def strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[Strip]:
 
 def _strip(
     model: WorldModel, batch: Batch, rollout: Rollout, b: int, s: int, moving: float
-) -> Strip:
+) -> ImageStrip:
     states = [rollout.carry.map(lambda x: x[b, s][None])]
     for k in range(max(HORIZONS)):
         states.append(model.imagine(states[-1], batch.action[b, s + k][None]))
-    shown = Carry.join([states[k] for k in STRIP], torch.cat)
+    shown = Carry.join([states[k] for k in STRIP_HORIZONS], torch.cat)
     predicted = model.decode_near(shown).clamp(0.0, 1.0)
-    observed = rollout.near[b, [s + k for k in STRIP]]
-    return Strip(moving, s, observed.cpu().numpy(), predicted.cpu().numpy())
+    observed = rollout.near[b, [s + k for k in STRIP_HORIZONS]]
+    return ImageStrip(moving, s, observed.cpu().numpy(), predicted.cpu().numpy())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from egovcp.model.depth import to_metres
 from egovcp.packages import is_installed
 from egovcp.robot_spec import G1
-from egovcp_train.heldout.open_loop import HORIZONS, STRIP, Strip
+from egovcp_train.heldout.open_loop import HORIZONS, STRIP_HORIZONS, ImageStrip
 from egovcp_train.heldout.report import HeldoutReport, Values
 
 if TYPE_CHECKING:
@@ -103,15 +103,15 @@ def draw(report: HeldoutReport) -> dict[str, Image]:
     return out
 
 
-def strip_picture(strips: Sequence[Strip], planner_hz: int = G1.planner_hz) -> Image:
+def strip_picture(strips: Sequence[ImageStrip], planner_hz: int = G1.planner_hz) -> Image:
     """Two rows per strip, observed and predicted; one column per horizon; near is bright."""
     lines = [_joined(images) for strip in strips for images in (strip.observed, strip.predicted)]
     sheet = np.concatenate(lines)
-    height, width = sheet.shape[0] / len(lines), sheet.shape[1] / len(STRIP)
-    figure, axes = _figure(1.2 * len(STRIP), 0.95 * len(lines) + 0.4)
+    height, width = sheet.shape[0] / len(lines), sheet.shape[1] / len(STRIP_HORIZONS)
+    figure, axes = _figure(1.2 * len(STRIP_HORIZONS), 0.95 * len(lines) + 0.4)
     axes.imshow(sheet, cmap="magma", vmin=0.0, vmax=1.0, interpolation="nearest")
-    ticks = [f"+{k} ({1e3 * k / planner_hz:.0f} ms)" for k in STRIP]
-    axes.set_xticks([(i + 0.5) * width for i in range(len(STRIP))], ["filtered", *ticks[1:]])
+    ticks = [f"+{k} ({1e3 * k / planner_hz:.0f} ms)" for k in STRIP_HORIZONS]
+    axes.set_xticks([(i + 0.5) * width for i in range(len(ticks))], ["filtered", *ticks[1:]])
     names = [f"{kind}\nrow {s.start}" for s in strips for kind in _KINDS]
     axes.set_yticks([(i + 0.5) * height for i in range(len(lines))], names)
     axes.tick_params(length=0, labelsize=8)
@@ -134,7 +134,7 @@ def calibration_picture(values: Values, found: dict[str, Any]) -> Image:
 
 
 def _joined(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n, 48, 64) -> one row of images with transparent gaps."""
+    """(n, H, W) -> one row of images with transparent gaps."""
     padded = np.pad(images, ((0, 0), (0, _GAP), (0, _GAP)), constant_values=np.nan)
     return np.concatenate(list(padded), axis=1)
 
@@ -173,8 +173,8 @@ def record(report: HeldoutReport, folder: Path, depth_max_m: float) -> Path | No
     stream = rr.RecordingStream("egovcp_open_loop")
     stream.save(path, default_blueprint=_blueprint(report))
     ahead = [
-        rr.TimeColumn("ticks_ahead", sequence=STRIP),
-        rr.TimeColumn("time_ahead", duration=[k / report.planner_hz for k in STRIP]),
+        rr.TimeColumn("ticks_ahead", sequence=STRIP_HORIZONS),
+        rr.TimeColumn("time_ahead", duration=[k / report.planner_hz for k in STRIP_HORIZONS]),
     ]
     for task, found in report.strips.items():
         for number, strip in enumerate(found):
@@ -189,7 +189,7 @@ def record(report: HeldoutReport, folder: Path, depth_max_m: float) -> Path | No
 
 
 def _buffers(near: NDArray[np.float32], depth_max_m: float) -> list[NDArray[np.uint8]]:
-    """(n, 48, 64) nearness -> n images in uint16 mm, as bytes."""
+    """(n, H, W) nearness -> n images in uint16 mm, as bytes."""
     from egovcp.log.messages import to_millimetres
 
     metres = to_metres(torch.from_numpy(near), depth_max_m).numpy()

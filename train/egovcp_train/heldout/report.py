@@ -21,14 +21,14 @@ from egovcp.model.privileged_value import PrivilegedValue, sample_actions
 from egovcp.model.value_losses import privileged_targets
 from egovcp.robot_spec import G1, RobotSpec
 from egovcp_train.datasets import to_tensors
-from egovcp_train.heldout.open_loop import OpenLoop, Strip, strips, top_strips
+from egovcp_train.heldout.open_loop import ImageStrip, OpenLoop, image_strips, select_strips
 
 EPISODES_AT_ONCE: Final = 16
 RANKED_ACTIONS: Final = 16
 OPEN_LOOP_EPISODES: Final = 64
 """Of each task, for open-loop predictions, which take most of the time."""
 ACTIVE_NATS: Final = 0.01  # KL below which a latent dimension carries no information
-WITHIN: Final = (1, 5, 25)  # rows; D is trained for 1, 25 are a second
+TERMINATION_HORIZONS: Final = (1, 5, 25)  # rows; D is trained on the first
 _FLAT: Final = 1e-12  # variance, units of return squared, below which something is constant
 
 
@@ -130,7 +130,7 @@ def termination_scores(
     """k -> AUC of "fails within k rows" (None without both outcomes), failing, rows."""
     logit, ahead, known = (torch.cat(x) for x in zip(*found, strict=True))
     out: dict[str, dict[str, float | int | None]] = {}
-    for k in WITHIN:
+    for k in TERMINATION_HORIZONS:
         usable = known >= k
         failing = ((ahead > 0) & (ahead <= k))[usable]
         out[str(k)] = {
@@ -183,7 +183,7 @@ class HeldoutReport(NamedTuple):
     None if it is unknown; JSON-able."""
     values: dict[str, Values]
     """Task -> Q and its target, for pictures."""
-    strips: dict[str, list[Strip]]
+    strips: dict[str, list[ImageStrip]]
     """Task -> some open-loop predictions, for pictures."""
     planner_hz: int = G1.planner_hz
     """Ticks per second."""
@@ -199,7 +199,7 @@ class TaskMeasurements:
         self.episodes = self.rows = 0
         self.open_loop = OpenLoop(stride, robot)
         self.termination: list[TerminationRows] = []
-        self.strips: list[Strip] = []
+        self.strips: list[ImageStrip] = []
         self.kl = torch.zeros(0)
         """Sum over the rows, of each dimension of z."""
         self.object_error = self.object_rows = 0.0
@@ -214,7 +214,7 @@ class TaskMeasurements:
         self.rows += int(batch.valid.sum())
         if open_loop:
             self.open_loop.add(model, batch, rollout)
-            self.strips = top_strips([*self.strips, *strips(model, batch, rollout)])
+            self.strips = select_strips([*self.strips, *image_strips(model, batch, rollout)])
         self.termination.append(termination_rows(model, batch, rollout))
         self._values.append(self._compare(model, rollout.carry, batch))
         if model.object_head is not None:
@@ -340,6 +340,6 @@ def scalars(tasks: dict[str, dict[str, Any]]) -> dict[str, float]:
             found[f"{task}/termination_auc_{k}"] = scores["auc"]
         for name in ("slope", "r2", "bias", "correlation", "ranking"):
             found[f"{task}/value_{name}"] = report["value"].get(name)
-        found[f"{task}/latent_active"] = report["latent"]["share"]
+        found[f"{task}/latent_active_share"] = report["latent"]["share"]
         found[f"{task}/object_rmse_m"] = report["object_rmse_m"]
     return {name: value for name, value in found.items() if value is not None}

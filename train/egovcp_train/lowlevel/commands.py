@@ -39,11 +39,12 @@ class Commands:
         self.difficulty = 0.0
         self.velocity = np.zeros((robots, 3))  # m/s, m/s, rad/s, ramped
         self._goal = np.zeros((robots, 3))
-        self._action = np.zeros((robots, ACTION_DIM))  # as the planner would send it
+        # Sent to the controller; it moves at the rate limit, but the height of a new command jumps.
+        self._action = np.zeros((robots, ACTION_DIM))
         self._target = np.zeros((robots, ACTION_DIM))  # towards which the action moves
-        self._held = np.zeros(robots, dtype=bool)  # whose random walk holds its targets
-        self._rest: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)  # planner ticks of holding
-        self._moves = np.zeros((robots, ACTION_DIM), dtype=bool)  # which follow the random walk
+        self._is_random = np.zeros((robots, ACTION_DIM), dtype=bool)  # follows a random walk
+        self._holds_targets = np.zeros(robots, dtype=bool)  # if random, for some planner ticks
+        self._hold_ticks_left: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)
         self._low = np.full(robots, -1.0)  # lower bound of the height's action
         self._ticks_left = np.zeros(robots, dtype=np.intp)
         self._tick = 0
@@ -58,22 +59,22 @@ class Commands:
         """(N,) robots with zero velocity, commanded and wanted."""
         return np.asarray(~(self.velocity.any(axis=1) | self._goal.any(axis=1)))
 
-    def keep(self, rows: NDArray[np.intp], seconds: Array) -> None:
-        """No other command for so many seconds (n,)."""
+    def keep_commands(self, rows: NDArray[np.intp], seconds: Array) -> None:
+        """Draw no other commands for so many seconds (n,)."""
         self._ticks_left[rows] = (seconds * CONTROLLER_HZ).astype(np.intp) + 1
 
     def move_hands(self, rows: NDArray[np.intp], target: Array) -> None:
         """Move hands to ``target`` (n, 6), normalised, at the rate limit, and end their random
         walk until the next command."""
-        self._moves[rows, :HEIGHT] = False
+        self._is_random[rows, :HEIGHT] = False
         self._target[rows, :HEIGHT] = target
 
     def reset(self, rows: NDArray[np.intp]) -> None:
         """New episodes: standing and neutral, with another command within a second."""
         self.velocity[rows] = self._goal[rows] = 0.0
         self._action[rows] = self._target[rows] = 0.0
-        self._moves[rows] = self._held[rows] = False
-        self._rest[rows] = 0
+        self._is_random[rows] = self._holds_targets[rows] = False
+        self._hold_ticks_left[rows] = 0
         self._ticks_left[rows] = self._rng.integers(5, 50, len(rows))
 
     def advance(self) -> None:
@@ -89,14 +90,15 @@ class Commands:
             self._walk_randomly()
 
     def _walk_randomly(self) -> None:
-        steps = ~self._held | (self._rest <= 0)
-        size = np.where(self._held, HELD_ETA, ACTION_ETA) * steps
+        holds, left = self._holds_targets, self._hold_ticks_left
+        steps = ~holds | (left <= 0)
+        size = np.where(holds, HELD_ETA, ACTION_ETA) * steps
         drawn = self._rng.integers(*HELD_TICKS, len(steps), endpoint=True)
-        self._rest = np.where(self._held & steps, drawn, self._rest) - 1
+        self._hold_ticks_left = np.where(holds & steps, drawn, left) - 1
         step = size[:, None] * self._rng.uniform(-1, 1, self._action.shape)
         low = np.full(step.shape, -1.0)
         low[:, HEIGHT] = self._low
-        self._target[:] = reflect(self._target + np.where(self._moves, step, 0.0), low)
+        self._target[:] = reflect(self._target + np.where(self._is_random, step, 0.0), low)
         limit = ACTION_RATE_LIMIT
         self._action += np.clip(self._target - self._action, -limit, limit)
 
@@ -106,8 +108,8 @@ class Commands:
         self._ticks_left[rows] = (rng.uniform(low, high, n) * CONTROLLER_HZ).astype(np.intp)
         walks = rng.random(n) > config.standing
         self._goal[rows] = np.where(walks[:, None], self._velocities(n), 0.0)
-        self._moves[rows] = (rng.random(n) > config.still_hands)[:, None]
-        self._held[rows] = rng.random(n) < config.held_hands
+        self._is_random[rows] = (rng.random(n) > config.still_hands)[:, None]
+        self._holds_targets[rows] = rng.random(n) < config.held_hands
         self._target[rows] = self._action[rows]
         heights = np.where(
             walks,
@@ -132,12 +134,12 @@ class Commands:
         return out
 
     def _set_height(self, rows: NDArray[np.intp], height: Array, walks: NDArray[np.bool_]) -> None:
-        """Half of the standing robots squat at random; the others keep one height."""
+        """Half of the standing robots squat at random; the others get one height, at once."""
         target = _height_action(height)
         squats = ~walks & (self._rng.random(len(rows)) < 0.5)
         lowest = between(*self._config.standing_height, self.difficulty)[0]
         bound = _height_action(np.full(len(rows), lowest))
-        self._moves[rows, HEIGHT] = squats
+        self._is_random[rows, HEIGHT] = squats
         self._low[rows] = np.where(squats, bound, -1.0)
         kept = self._action[rows, HEIGHT]
         self._action[rows, HEIGHT] = self._target[rows, HEIGHT] = np.where(squats, kept, target)
@@ -155,7 +157,7 @@ def random_push(
 ) -> Array:
     """(n, 2) m/s to add to the pelvis's horizontal velocity, any direction."""
     low, high = config.push
-    most = between((low, low), (high, high), difficulty)[0]
+    most = low + difficulty * (high - low)
     angle = rng.uniform(-np.pi, np.pi, n)
     return horizontal(rng.uniform(0.0, most, n), angle)
 

@@ -145,6 +145,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.device = "cpu"
         self.cfg = asdict(task)
         self.task = task
+        self._weights = asdict(task.rewards)
         self.physics = BatchPhysics(robots, feet, task.disturbances, threads, seed)
         self.seed, self.rng = seed, np.random.default_rng(seed)
         self.logic = TaskLogic(robots, task, walk, sensors, self.rng)
@@ -234,8 +235,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
 
     def _weighted(self, terms: dict[str, Array]) -> Array:
         """(N,) reward of the tick."""
-        weights = asdict(self.task.rewards)
-        parts = [weights[name] * DT * value for name, value in terms.items()]
+        parts = [self._weights[name] * DT * value for name, value in terms.items()]
         return np.asarray(sum(parts))
 
     def _observe(self, x: Snapshot) -> None:

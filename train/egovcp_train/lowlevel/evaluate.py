@@ -36,11 +36,12 @@ class LowLevelEvalConfig:
     """Evaluate a low-level controller under randomised physics on the stock collision model.
 
     Every skill is played by --episodes robots of different mass, friction and gains, with
-    delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
-    Errors, and the share of the time in which it steps (the gait moves a foot), are means over the
-    time before a fall. The camera columns are the mean rotation of the head camera, one and eight
-    planner steps (of 40 ms) apart, in pixels of the depth image: up, across, and at the image's
-    edge by roll.
+    delay and sensor noise. A fall is a tilt of more than 1 rad, a pelvis below 0.35 m, or
+    a velocity above 100 m/s or rad/s. Errors, and the share of the time in which it steps (the gait
+    moves a foot), are means over the time before a fall; errors leave out the first 2 s of walking,
+    and the first 0.6 s of each target of reach and squat.
+    The camera columns are the mean rotation of the head camera, one and eight planner steps (of
+    40 ms) apart, in pixels of the depth image: up, across, and at the image's edge by roll.
     The column torque is the RMS torque of the most loaded joint, relative to its motor's peak
     torque; lowlevel.json has all joints.
     """
@@ -166,11 +167,13 @@ def _play_all(
 
 
 def _chosen(names: str) -> list[Skill]:
+    """The skills, each once."""
     by_name = {skill.name: skill for skill in SKILLS}
-    for name in names.split(","):
+    chosen = dict.fromkeys(name.strip() for name in names.split(","))
+    for name in chosen:
         if name not in by_name:
             raise UsageError(f"unknown skill {name!r} in --skills{suggest(name, by_name)}")
-    return [by_name[name] for name in names.split(",")]
+    return [by_name[name] for name in chosen]
 
 
 def _figures(skill: Skill, parts: Sequence[Any], requested: int) -> dict[str, Any]:

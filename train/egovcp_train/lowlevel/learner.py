@@ -120,7 +120,8 @@ class LowLevelLearner(OnPolicyLearner):
     def record(
         self, log: Log, obs: Any, reward: Tensor, done: Tensor, extras: dict[str, Any]
     ) -> None:
-        self._seen.append(obs["policy"])
+        if self._start is not None and self.iteration < self._critic_warmup:
+            self._seen.append(obs["policy"])
         fell = done.bool() & ~extras["time_outs"]
         log["falls_per_second"].append(float(fell.sum()) / self.env.num_envs * CONTROLLER_HZ)
         log["reward/total"].append(float(reward.mean()) * CONTROLLER_HZ)
@@ -219,12 +220,11 @@ def _copy(actor: Any, policy: WalkPolicy) -> None:
             f"--init: found layers of {found} neurons, expected {expected}; choose "
             f"--network.actor={found[:-1]}"
         )
-    normal = actor.obs_normalizer
     with torch.no_grad():
         for module, (weight, bias) in zip(linear, policy.layers, strict=True):
             module.weight.copy_(torch.from_numpy(weight))
             module.bias.copy_(torch.from_numpy(bias))
-        normal._mean.copy_(torch.from_numpy(policy.mean))
-        normal._std.copy_(torch.from_numpy(policy.std) - normal.eps)
-        normal._var.copy_(normal._std**2)
-        normal.count.fill_(_FRAMES)
+    normal = actor.obs_normalizer
+    mean, std = torch.from_numpy(policy.mean)[None], torch.from_numpy(policy.std)[None] - normal.eps
+    count = torch.tensor(_FRAMES)
+    normal.load_state_dict({"_mean": mean, "_std": std, "_var": std**2, "count": count})

@@ -97,10 +97,10 @@ def env_cfg(
         commands={LOGIC: term},
         actions={"targets": TargetsCfg(disturbances=task.disturbances)},
         observations={
-            name: ObservationGroupCfg(
-                {"walk": ObservationTermCfg(func=terms.observation, params={"which": which})}
+            group: ObservationGroupCfg(
+                {"walk": ObservationTermCfg(func=terms.observation, params={"group": group})}
             )
-            for which, name in enumerate(("policy", "privileged"))
+            for group in ("policy", "privileged")
         },
         events=_events(task.disturbances),
         rewards={

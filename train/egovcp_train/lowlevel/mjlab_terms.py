@@ -30,7 +30,7 @@ from egovcp_train.lowlevel.walls import NO_WALL_DISTANCE
 from egovcp_train.on_policy import RslRlPpoConfig
 
 ROBOT: Final = "robot"  # name in the scene
-LOGIC: Final = "loop"  # name of the command term
+LOGIC: Final = "task_logic"  # name of the command term
 _FEET: Final = ("left_ankle_roll_link", "right_ankle_roll_link")
 _PALMS: Final = ("left_palm", "right_palm")
 _NEVER: Final = 1e9  # s; `Commands` has its own intervals
@@ -65,7 +65,7 @@ class TaskLogicTerm(CommandTerm):
         self.robot = MjlabRobot(env)
         self._falls = self._tracked = 0.0
         self._ticks = 0
-        self._observations: tuple[torch.Tensor, ...] | None = None
+        self._observations: dict[str, torch.Tensor] = {}
         self._rewards: dict[str, torch.Tensor] = {}
 
     @property
@@ -73,23 +73,27 @@ class TaskLogicTerm(CommandTerm):
         """(N, 10) v, hands, height."""
         return self._tensor(self.logic.commands.vector)
 
-    def observation(self, which: int) -> torch.Tensor:
-        """0: input of the policy (N, 95); 1: additional input of the critic (N, 17)."""
-        if self._observations is None:
-            seen = self.logic.observe(
+    def observation(self, group: str) -> torch.Tensor:
+        """policy: its input (N, 95); privileged: additional input of the critic (N, 17)."""
+        if not self._observations:
+            policy, privileged = self.logic.observe(
                 self.robot.snapshot(),
                 self.robot.friction(),
                 np.full(self.num_envs, NO_WALL_DISTANCE),
             )
-            self._observations = tuple(self._tensor(part) for part in seen)
-        return self._observations[which]
+            self._observations["policy"] = self._tensor(policy)
+            self._observations["privileged"] = self._tensor(privileged)
+        return self._observations[group]
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
         """(N, 15) -> joint targets (N, 29), rad."""
         return self._tensor(self.logic.targets(action.detach().cpu().numpy()))
 
-    def update_rewards(self) -> torch.Tensor:
-        """(N,) which robots have fallen; called once per tick, before `reward`."""
+    def evaluate_tick(self) -> torch.Tensor:
+        """Compute the rewards and adapt the difficulty; returns which robots (N,) have fallen.
+
+        Called once per tick, before `reward`.
+        """
         x = self.robot.snapshot()
         terms, fell = self.logic.reward_terms(x), self.logic.fallen
         finite = rewards.finite_terms(terms, fell, x.broken)
@@ -111,7 +115,7 @@ class TaskLogicTerm(CommandTerm):
         """Once per tick (or reset), with the simulation up to date."""
         if env_ids is None:
             self.logic.commands.advance()
-        self._observations = None
+        self._observations = {}
 
     def _adapt(self, fell: NDArray[np.bool_], velocity: Array) -> None:
         """Apply the curriculum once per iteration of PPO."""
@@ -250,14 +254,14 @@ def logic_term(env: ManagerBasedRlEnv) -> TaskLogicTerm:
     return term
 
 
-def observation(env: ManagerBasedRlEnv, which: int) -> torch.Tensor:
+def observation(env: ManagerBasedRlEnv, group: str) -> torch.Tensor:
     """See `TaskLogicTerm.observation`."""
-    return logic_term(env).observation(which)
+    return logic_term(env).observation(group)
 
 
 def fallen(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """(N,)."""
-    return logic_term(env).update_rewards()
+    """(N,); also computes the rewards, because mjlab evaluates terminations before rewards."""
+    return logic_term(env).evaluate_tick()
 
 
 def reward(env: ManagerBasedRlEnv, term: str) -> torch.Tensor:

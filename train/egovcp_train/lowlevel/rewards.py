@@ -77,7 +77,7 @@ def terms(
         torso: its angular velocity, including this tick.
         pushed: (N,) whether a push was so recent that steps cost nothing.
     """
-    height, pitch, gait = walk.height, walk.pitch, walk.gait.amount
+    height, pitch, gait = walk.height, walk.pitch, walk.gait.blend
     rotation = rotation_matrix(x.quaternion)
     forward = heading(rotation)
     up = rotation[:, 2]  # the world's vertical in the pelvis frame

@@ -288,11 +288,11 @@ class SkillRecorder:
 
     def write(self) -> None:
         """Write the files."""
-        from egovcp.log.picture import PictureSink
         from egovcp.log.rerun import RerunSink
+        from egovcp.log.rollout_video import RolloutVideoSink
 
         for sink in (
-            PictureSink(self._stem.with_suffix(".gif")),
+            RolloutVideoSink(self._stem.with_suffix(".gif")),
             RerunSink(self._stem.with_suffix(".rrd")),
         ):
             sink.open(RunInfo(self._name))

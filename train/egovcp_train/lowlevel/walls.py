@@ -32,7 +32,7 @@ _PRESS: Final = (0.0, 0.08)  # m, hand targets behind the wall's surface
 
 
 class Walls:
-    """One wall per robot, in sight only from a push until some seconds after it."""
+    """One wall per robot, in the scene from a push until some seconds after it."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Walls:
         self.position[at], self.yaw[at] = surface[chosen], yaw[chosen]
         self._times[at], self._hands[at] = times[chosen], hands[chosen]
         self._since[at], self.active[at] = 0.0, True
-        self._commands.keep(at, times[chosen, 2])
+        self._commands.keep_commands(at, times[chosen, 2])
         return chosen, kick
 
     def advance(self, x: Snapshot) -> None:

@@ -1,8 +1,9 @@
 """A simulated G1 behind the protocol of LeRobot's bridge.
 
 One call of `FakeBridge.step` advances it by 5 ms: receive commands, step the physics, send a state,
-and send a depth image when the camera has a new one. Without commands for 0.2 s its motors damp;
-this is a choice of the fake, not known behaviour of the robot.
+and send a depth image when the camera has a new one. Without commands for 0.2 s its motors damp,
+with the gains of `egovcp.robot.g1` instead of those that the runner sends in DAMP. LeRobot's bridge
+has no such watchdog: assume that a real robot's motors keep the last command.
 """
 
 from __future__ import annotations

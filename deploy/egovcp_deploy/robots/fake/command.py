@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import queue
 import signal
@@ -35,7 +36,7 @@ _MIN_PAUSE: Final = 1.5  # s: in HOLD the hands take up to 1 s to return to the 
 _MAX_STEPS: Final = 20  # caught up after a delay; the rest are dropped
 _EPILOG: Final = (
     "Motors use LeRobot's JSON over ZMQ, depth the format of egovcp-depth-server. Without a "
-    "command for 0.2 s the motors damp, which a real robot does not do. While it runs it reads "
+    "command for 0.2 s the motors damp; assume that a real robot's keep the last command. It reads "
     "commands from the terminal, one per line: Enter or release makes the gantry release the "
     f"robot, quit ends the program, and {', '.join(FAULT_COMMANDS)} inject faults (push 0.5 0, "
     "drop 0.3, mode 4, hot_motor left_knee 125, dropped_motor left_knee, other_publisher off, "
@@ -142,9 +143,11 @@ def _apply_lines(lines: queue.SimpleQueue[str], faults: InjectedFaults) -> bool:
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:
-    """Commands from the terminal; runs in a thread."""
-    for line in sys.stdin:
-        lines.put(line.strip())
+    """Commands from the terminal; runs in a thread, which no input ends."""
+    if isinstance(sys.stdin, io.TextIOWrapper):  # None if it was closed, `<&-`
+        sys.stdin.reconfigure(errors="backslashreplace")
+        for line in sys.stdin:
+            lines.put(line.strip())
 
 
 #: Buttons that are pressed in each phase after the first episode.

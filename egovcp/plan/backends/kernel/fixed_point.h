@@ -1,11 +1,11 @@
 /* Activations in 16-bit fixed point (words).
  *
- * Hidden layers have the unit UNIT, h and tanh 2^15. Functions are piecewise linear between NODES nodes
- * (`integer_network.py`), with errors below 8e-4 for SiLU and 2e-4 for tanh; a byte resolves 4e-3. */
+ * Hidden layers have the unit HIDDEN_ONE, h and tanh 2^15. Functions are piecewise linear between NODES
+ * nodes (`integer_network.py`), with errors below 8e-4 for SiLU and 2e-4 for tanh; a byte resolves 4e-3. */
 #pragma once
 #include "vectors.h"
 
-enum { UNIT = 2048, NODES = 64, LEAST_SILU = 571 }; /* in words, negative */
+enum { HIDDEN_ONE = 2048, NODES = 64, LEAST_SILU = 571 }; /* in words, negative */
 
 /* NODES words. */
 typedef struct {
@@ -72,7 +72,7 @@ INLINE Words on_lines(Lines l, Words far, const int bits) {
     return entries(&l.value, node) + product(entries(&l.slope, node), left(far, 16 - bits));
 }
 
-/* x in UNIT -> SiLU(x) = max(x, 0) + SiLU(-|x|) in UNIT. */
+/* x in HIDDEN_ONE -> SiLU(x) = max(x, 0) + SiLU(-|x|) in HIDDEN_ONE. */
 INLINE Words silu(Lines l, Words x) { return larger(x, all(0)) + on_lines(l, absolute(x), 8); }
 
 /* x in 2^13 -> tanh(x) in 2^15. */
@@ -89,14 +89,14 @@ INLINE Words tanh_of(Lines l, Words x) {
 #endif
 }
 
-/* A row of a hidden layer as bytes x = scale * u - LEAST_SILU / UNIT; `most` bounds its words. */
+/* A row of a hidden layer as bytes x = scale * u - LEAST_SILU / HIDDEN_ONE; `most` bounds its words. */
 INLINE float bytes_of_hidden(const int16_t *x, int count, int most, Byte *u) {
     const int above = most + LEAST_SILU, rate = (int)(255.0f * 65536.0f / (float)above);
     const Words start = all(LEAST_SILU + above / 510), times = all(rate); /* + half a byte */
     for (int n = 0; n < count; n += 2 * WORDS)
         store_bytes(u + n, product_of_unsigned(load_words(x + n) + start, times),
                     product_of_unsigned(load_words(x + n + WORDS) + start, times));
-    return 65536.0f / (float)(UNIT * rate);
+    return 65536.0f / (float)(HIDDEN_ONE * rate);
 }
 
 /* A row of h as bytes x = scale * (u - 128); `most` bounds its words. */

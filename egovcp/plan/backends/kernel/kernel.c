@@ -63,10 +63,10 @@ static void head_outputs(const Network *net, const Head *head, const float *from
     Bytes bytes;
     if (k > 0) in = (Inputs){&at->h_bytes, &at->z_bytes, action, net->actions, 0};
     hidden(net, &head->first, in, &x, &bytes);
-    const int many = head->many.outputs;
+    const int many = head->vector_top.outputs;
     hidden(net, &head->second, (Inputs){.wide = &bytes}, &x, many ? &bytes : 0);
-    if (many) top_product(&head->many, &bytes, out);
-    else dot_product(&head->one, &x, out);
+    if (many) top_product(&head->vector_top, &bytes, out);
+    else dot_product(&head->scalar_top, &x, out);
 }
 
 /* The mean of the distribution over bins whose logits are `outputs`. */
@@ -89,7 +89,7 @@ static void value(const Network *net, const SharedPrefix *prefix, const Carry *a
     float outputs[ROWS * MAX_NARROW];
     head_outputs(net, &net->value, prefix->value, at, k, action, as->bins ? outputs : q);
     for (int r = 0; r < ROWS; r++) {
-        if (as->bins) q[r] = mean_of_bins(as, outputs + r * net->value.many.outputs);
+        if (as->bins) q[r] = mean_of_bins(as, outputs + r * net->value.vector_top.outputs);
         q[r] = as->mean + q[r] * as->std;
     }
 }
@@ -141,7 +141,7 @@ static void block(const Network *net, const SharedPrefix *prefix, int steps, con
 
 /* Memory layout of the weights of wide products: inputs padded to multiples of DEPTH with zeros, outputs
  * in LANES, inputs in GROUPs. */
-void layout(int32_t *depth, int32_t *lanes, int32_t *group) {
+void weight_layout(int32_t *depth, int32_t *lanes, int32_t *group) {
     *depth = DEPTH, *lanes = LANES, *group = GROUP;
 }
 

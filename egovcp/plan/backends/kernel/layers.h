@@ -225,7 +225,7 @@ static void recur(const Network *net, Inputs in, const int16_t *before, int stri
             for (int g = 0; g < 3; g++)
                 gate[g] = normal(row + g * size + i, times, gamma + g * size + i, beta + g * size + i);
             const Words reset = tanh_of(lines, gate[0]), update = tanh_of(lines, gate[2]);
-            const Words twice = sum(gate[1], product(reset, gate[1])); /* in UNIT; 2^13 is 4 UNIT */
+            const Words twice = sum(gate[1], product(reset, gate[1])); /* 2^13 is 4 HIDDEN_ONE */
             const Words new = halved(tanh_of(lines, sum(twice, twice)), 1);
             const Words old = halved(load_words(before + r * stride + i), 1);
             Words v = larger(sum(sum(old, new), product(update, new - old)), all(-32767));
@@ -256,9 +256,9 @@ static void top_product(const Top *t, const Bytes *x, float *out) {
 typedef struct {
     int32_t hidden, latent;
     int32_t gates, heads, mix; /* sums of each; `heads`: of Q and of the reward */
-    const float *of_h;         /* [hidden][gates + heads] */
-    const float *of_z;         /* [latent][heads + mix] */
-} Start;
+    const float *h_weights;    /* [hidden][gates + heads] */
+    const float *z_weights;    /* [latent][heads + mix] */
+} PrefixWeights;
 
 /* y [N] += x [K] weight [K][N]. */
 static void add_product(int inputs, int outputs, const float *x, const float *weight, float *y) {
@@ -269,15 +269,15 @@ static void add_product(int inputs, int outputs, const float *x, const float *we
 
 /* h [hidden] in fixed point [hidden + 16], and the sums [gates + heads + mix] of h and z [latent], which
  * are zero on entry. Returns 0, or NaN if the state is not finite. */
-float start(const Start *s, const float *h, const float *z, int16_t *words, float *sums) {
+float shared_prefix(const PrefixWeights *s, const float *h, const float *z, int16_t *words, float *sums) {
     const Floats one = all_floats(32768.0f);
     float nan_or_zero = 0.0f;
     for (int i = 0; i < s->hidden; i += LANES) {
         const Words v = words_of(load(h + i) * one, all_floats(0.0f));
         memcpy(words + i, &v, LANES * sizeof(int16_t));
     }
-    add_product(s->hidden, s->gates + s->heads, h, s->of_h, sums);
-    add_product(s->latent, s->heads + s->mix, z, s->of_z, sums + s->gates);
+    add_product(s->hidden, s->gates + s->heads, h, s->h_weights, sums);
+    add_product(s->latent, s->heads + s->mix, z, s->z_weights, sums + s->gates);
     for (int i = 0; i < s->hidden; i++) nan_or_zero += 0.0f * h[i];
     for (int i = 0; i < s->latent; i++) nan_or_zero += 0.0f * z[i];
     return nan_or_zero;

@@ -51,8 +51,8 @@ typedef struct { /* many outputs, from the bytes of a hidden layer */
 
 typedef struct { /* two hidden layers over h, z and the action, with one output or with many */
     Layer first, second;
-    Dot one;
-    Top many; /* if it has outputs */
+    Dot scalar_top;
+    Top vector_top; /* if it has outputs */
 } Head;
 
 typedef struct { /* conversion of the outputs of the heads to V */

@@ -1,7 +1,8 @@
-"""Pictures and videos of a rollout show the right moments and survive missing parts."""
+"""Images and videos of a rollout show the right moments and survive missing parts."""
 
 from __future__ import annotations
 
+import pickle
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +14,17 @@ import pytest
 from PIL import Image, ImageSequence
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.log import picture
-from egovcp.log.picture import (
+from egovcp.log import rollout_video
+from egovcp.log.rollout_video import (
     AHEAD,
     SIZE,
     STRIDE,
-    PictureSink,
+    RolloutVideoSink,
     curves,
     depth_rows,
-    imagined_of,
     key_frames,
-    rollout_picture,
     video_frames,
+    write_key_frames,
     write_videos,
 )
 from egovcp.log.scene_plot import scene_faces, view_offset
@@ -52,34 +52,45 @@ def test_key_frames_span_the_run_without_events(make_tick: Any, length: int) -> 
     assert len(set(moments)) == len(moments) == min(length, 7)
 
 
-def test_imagined_images_are_shown_at_the_tick_they_predict(make_tick: Any) -> None:
-    bare = make_tick(0, bare=True)
-    film = lambda i: np.full((AHEAD, 48, 64), 100.0 * i) + np.arange(AHEAD)[:, None, None]  # noqa: E731
-    ticks = [replace(bare, depth_imagined=film(i)) for i in range(AHEAD + 3)]
-    shown = imagined_of(ticks, AHEAD + 2)
-    assert shown is not None
-    assert np.unique(shown).tolist() == [100.0 * 2 + AHEAD - 1]
-    assert imagined_of(ticks, AHEAD - 1) is None
+def test_imagined_images_are_shown_at_the_tick_they_predict(
+    make_tick: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: dict[int, float] = {}
+
+    def draw(ticks: Any, imagined: Any, *rest: object) -> None:
+        rows = depth_rows(ticks, imagined, G1)
+        (row,) = [row for name, row in rows.items() if "imagined" in name]
+        shown.update(
+            (tick.index, image[0, 0])
+            for tick, image in zip(ticks, row, strict=True)
+            if image is not None
+        )
+
+    monkeypatch.setattr(rollout_video, "write_key_frames", draw)
+    sink = RolloutVideoSink(Path("a.png"))
+    for i in (0, 1, 2, AHEAD, AHEAD + 2, AHEAD + 3):  # the others are missing
+        film = 100.0 * i + np.ones((2 * AHEAD, 48, 64)).cumsum(0)
+        sink.write(replace(make_tick(i, bare=True), depth_imagined=film))
+    sink.close()
+    assert shown == {AHEAD: AHEAD, AHEAD + 2: 200 + AHEAD}
 
 
 def test_missing_data_has_neither_row_nor_curve(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=True) for i in range(AHEAD + 2)]
-    last = len(ticks) - 1
-    assert list(depth_rows(ticks, [0, last], G1)) == ["depth seen"]
+    assert list(depth_rows(ticks, {}, G1)) == ["depth seen"]
     assert list(curves(ticks)) == ["return so far"]
     ticks[-1] = replace(ticks[-1], depth_reconstructed=np.ones((48, 64)), value=0.5)
-    assert list(depth_rows(ticks, [0, last], G1)) == ["depth seen", "reconstructed"]
-    assert list(depth_rows(ticks, [0], G1)) == ["depth seen"]
+    assert list(depth_rows(ticks, {}, G1)) == ["depth seen", "reconstructed"]
+    assert list(depth_rows(ticks[:1], {}, G1)) == ["depth seen"]
     assert list(curves(ticks)) == ["value of the plan", "return so far"]
-    ticks[last - AHEAD] = replace(ticks[last - AHEAD], depth_imagined=np.ones((AHEAD, 48, 64)))
-    assert len(depth_rows(ticks, [0, last], G1)) == 3
+    assert len(depth_rows(ticks, {ticks[-1].index: np.ones((48, 64))}, G1)) == 3
 
 
-def test_fewer_rows_make_a_lower_picture(tmp_path: Path, make_tick: Any) -> None:
+def test_fewer_rows_make_a_lower_image(tmp_path: Path, make_tick: Any) -> None:
     sizes = []
     for bare in (False, True):
         path = tmp_path / f"{bare}.png"
-        rollout_picture([make_tick(i, bare=bare) for i in range(2)], path, "", G1)
+        write_key_frames([make_tick(i, bare=bare) for i in range(2)], {}, path, "", G1)
         with Image.open(path) as image:
             sizes.append(image.size)
     assert sizes[0][0] == sizes[1][0]
@@ -87,9 +98,9 @@ def test_fewer_rows_make_a_lower_picture(tmp_path: Path, make_tick: Any) -> None
 
 
 @pytest.mark.parametrize("bare", [False, True])
-def test_close_writes_the_picture(tmp_path: Path, make_tick: Any, bare: bool) -> None:
+def test_close_writes_the_key_frames(tmp_path: Path, make_tick: Any, bare: bool) -> None:
     path = tmp_path / "a.png"
-    sink = PictureSink(path)
+    sink = RolloutVideoSink(path)
     sink.open(RunInfo("ball"))
     sink.write(make_tick(0, bare=bare))
     assert not path.exists()
@@ -100,19 +111,20 @@ def test_close_writes_the_picture(tmp_path: Path, make_tick: Any, bare: bool) ->
         assert len(image.convert("L").getcolors()) > 20
 
 
-def test_only_the_shown_imagined_images_are_kept(make_tick: Any) -> None:
+def test_only_what_is_shown_is_kept(make_tick: Any) -> None:
     images = np.zeros((2 * AHEAD, 48, 64))
-    kept = weakref.ref(images)
-    sink = PictureSink()
-    sink.write(replace(make_tick(0, bare=True), depth_imagined=images))
+    kept, image_bytes = weakref.ref(images), images[0].nbytes
+    sink = RolloutVideoSink()
+    sink.write(replace(make_tick(0), depth_imagined=images))
     del images
     assert kept() is None
+    assert len(pickle.dumps(sink)) < 3 * image_bytes
 
 
-def test_a_picture_is_never_overwritten(tmp_path: Path) -> None:
+def test_a_file_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"precious")
     with pytest.raises(EnvironmentFailure, match="exists already"):
-        PictureSink(tmp_path / "a.png").open(RunInfo("ball"))
+        RolloutVideoSink(tmp_path / "a.png").open(RunInfo("ball"))
 
 
 @pytest.mark.parametrize("way", [(8.0, 0.0), (0.0, -5.0), (-3.0, 4.0)])
@@ -139,7 +151,7 @@ def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
 
 def test_frames_change_with_the_depth_image(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=False) for i in range(2 * STRIDE)]
-    first, second = video_frames(ticks, G1)
+    first, second = video_frames(ticks, {}, G1)
     assert first.shape == (SIZE[1], SIZE[0], 3)
     assert (first != second).any()
     assert len(np.unique(first)) > 20
@@ -148,7 +160,7 @@ def test_frames_change_with_the_depth_image(make_tick: Any) -> None:
 @pytest.mark.parametrize("bare", [False, True])
 def test_a_gif_has_one_frame_per_stride(tmp_path: Path, make_tick: Any, bare: bool) -> None:
     path = tmp_path / "a.gif"
-    sink = PictureSink(path)
+    sink = RolloutVideoSink(path)
     sink.open(RunInfo("ball"))
     for i in range(6):
         sink.write(make_tick(i, bare=bare))
@@ -164,8 +176,8 @@ def test_a_gif_has_the_speed_of_the_robot(
 ) -> None:
     path = tmp_path / "a.gif"
     steps = (np.full((8, 8, 3), 20 * i, np.uint8) for i in range(9))
-    monkeypatch.setattr(picture, "video_frames", lambda ticks, robot: steps)
-    write_videos([], [path], replace(G1, planner_hz=30))
+    monkeypatch.setattr(rollout_video, "video_frames", lambda *arguments: steps)
+    write_videos([], {}, [path], replace(G1, planner_hz=30))
     durations = []
     with Image.open(path) as image:
         for frame in ImageSequence.Iterator(image):
@@ -175,7 +187,7 @@ def test_a_gif_has_the_speed_of_the_robot(
 
 def test_an_mp4_has_the_same_frames(tmp_path: Path, make_tick: Any) -> None:
     path = tmp_path / "a.mp4"
-    sink = PictureSink(path)
+    sink = RolloutVideoSink(path)
     sink.open(RunInfo("ball"))
     for i in range(6):
         sink.write(make_tick(i, bare=False))

@@ -7,7 +7,7 @@ left out. A video frame shows the robot, the depth image and the imagined image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -16,10 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import EnvironmentFailure
 from egovcp.log.meshes import link_meshes
 from egovcp.log.scene_plot import AXES_OPTIONS, draw_scene
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import RunInfo, Tick, existing_file_error
 from egovcp.packages import require_packages
 from egovcp.robot_spec import G1, RobotSpec
 
@@ -32,7 +31,7 @@ _DPI: Final = 100  # of a video
 SIZE: Final = (640, 360)
 """Width and height of a video, pixels; even, as H.264 requires."""
 STRIDE: Final = 2
-"""Steps between frames of a video: 12.5 frames per second."""
+"""Steps between frames of a video."""
 _COLOURS: Final = {
     "value of the plan": "C0",
     "termination probability": "C3",
@@ -46,10 +45,15 @@ _CURVES_INCH: Final = 2.408  # the curves
 type Frame = NDArray[np.uint8]
 type DepthRows = dict[str, list[NDArray[np.floating] | None]]
 type Curves = dict[str, list[float | None]]
+type ImaginedImages = Mapping[int, NDArray[np.floating]]
+"""`Tick.index` -> its depth image (H, W) in m, as imagined `AHEAD` ticks before."""
 
 
-class PictureSink:
-    """Collects the ticks of a run and draws them on `close`, as a picture or a video."""
+class RolloutVideoSink:
+    """Collects the ticks of a run and draws them on `close`, as a PNG or a video.
+
+    Memory and the time of `close` grow with the run, so live runs of a robot have none.
+    """
 
     def __init__(self, *paths: Path) -> None:
         """``paths``: ``.png`` for key frames, ``.gif`` or ``.mp4`` for a video."""
@@ -57,42 +61,47 @@ class PictureSink:
         self._title = ""
         self._robot = G1
         self._ticks: list[Tick] = []
+        self._imagined: dict[int, NDArray[np.floating]] = {}  # see `ImaginedImages`
 
     def open(self, info: RunInfo) -> None:
         """Check that the files do not exist."""
         for path in self._paths:
             if path.exists():
-                raise EnvironmentFailure(
-                    f"{path} exists already; recordings are never overwritten: choose another"
-                )
+                raise existing_file_error(path)
         self._robot = info.robot
         self._title = f"{info.task}, seed {info.seed}, episode {info.episode}"
 
     def write(self, tick: Tick) -> None:
-        """Keep the tick without candidates and later imagined images."""
+        """Keep what is drawn of the tick: of its imagined images, that of `AHEAD` ticks later."""
         images = tick.depth_imagined
-        shown = None if images is None else images[:AHEAD].copy()
-        self._ticks.append(replace(tick, candidates=None, depth_imagined=shown))
+        if images is not None and len(images) >= AHEAD:
+            self._imagined[tick.index + AHEAD] = images[AHEAD - 1].copy()
+        self._ticks.append(
+            replace(tick, depth_imagined=None, plan=None, candidates=None, value_maps=())
+        )
 
     def close(self) -> None:
         """Draw the files, if there are ticks."""
         ticks, self._ticks = self._ticks, []
+        imagined, self._imagined = self._imagined, {}
         if not ticks:
             return
         videos = [path for path in self._paths if path.suffix != ".png"]
         for path in set(self._paths).difference(videos):
-            rollout_picture(ticks, path, self._title, self._robot)
+            write_key_frames(ticks, imagined, path, self._title, self._robot)
         if videos:
-            write_videos(ticks, videos, self._robot)
+            write_videos(ticks, imagined, videos, self._robot)
 
 
-def rollout_picture(ticks: Sequence[Tick], path: Path, title: str, robot: RobotSpec) -> None:
-    """Draw ``ticks`` (in order, without gaps) into the PNG ``path``."""
+def write_key_frames(
+    ticks: Sequence[Tick], imagined: ImaginedImages, path: Path, title: str, robot: RobotSpec
+) -> None:
+    """Draw ``ticks``, in order, into the PNG ``path``."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     frames = key_frames(ticks)
-    rows = depth_rows(ticks, frames, robot)
+    rows = depth_rows([ticks[i] for i in frames], imagined, robot)
     height = _TOP_INCH + _ROW_INCH * (1 + len(rows)) + _CURVES_INCH
     figure = Figure(figsize=(2.1 * len(frames) + 0.5, height), facecolor="white")
     FigureCanvasAgg(figure)
@@ -118,13 +127,13 @@ def key_frames(ticks: Sequence[Tick]) -> list[int]:
     return sorted({int(i) for i in np.rint(np.linspace(begin, end, KEY_FRAMES))})
 
 
-def depth_rows(ticks: Sequence[Tick], frames: Sequence[int], robot: RobotSpec) -> DepthRows:
-    """The rows of depth images; a row without any image is left out."""
+def depth_rows(ticks: Sequence[Tick], imagined: ImaginedImages, robot: RobotSpec) -> DepthRows:
+    """The rows of depth images of the ``ticks``; a row without any image is left out."""
     before = f"imagined\n{AHEAD / robot.planner_hz:.2f} s before"
     rows: DepthRows = {
-        "depth seen": [ticks[i].depth / 1000.0 for i in frames],
-        "reconstructed": [ticks[i].depth_reconstructed for i in frames],
-        before: [imagined_of(ticks, i) for i in frames],
+        "depth seen": [tick.depth / 1000.0 for tick in ticks],
+        "reconstructed": [tick.depth_reconstructed for tick in ticks],
+        before: [imagined.get(tick.index) for tick in ticks],
     }
     return {name: row for name, row in rows.items() if any(depth is not None for depth in row)}
 
@@ -144,12 +153,6 @@ def _draw_images(
             draw_depth(axes, images[column], robot)
             if column == 0:
                 axes.set_ylabel(name, fontsize=9)
-
-
-def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
-    """The image of tick i imagined at tick i - AHEAD, (48, 64) m; None: there is none."""
-    images = ticks[i - AHEAD].depth_imagined if i >= AHEAD else None
-    return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
 
 
 def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None, robot: RobotSpec) -> None:
@@ -219,19 +222,23 @@ def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
         )
 
 
-def write_videos(ticks: Sequence[Tick], paths: Sequence[Path], robot: RobotSpec) -> None:
+def write_videos(
+    ticks: Sequence[Tick], imagined: ImaginedImages, paths: Sequence[Path], robot: RobotSpec
+) -> None:
     """Draw ``ticks`` (in order, without gaps) into each path, a ``.gif`` or ``.mp4``.
 
     Raises:
         EnvironmentFailure: the package that encodes this format is not installed.
     """
-    images, dt = list(video_frames(ticks, robot)), 1.0 / robot.planner_hz
+    images, dt = list(video_frames(ticks, imagined, robot)), 1.0 / robot.planner_hz
     for path in paths:
         write = _write_gif if path.suffix == ".gif" else _write_mp4
         write(images, path, dt)
 
 
-def video_frames(ticks: Sequence[Tick], robot: RobotSpec) -> Iterator[Frame]:
+def video_frames(
+    ticks: Sequence[Tick], imagined: ImaginedImages, robot: RobotSpec
+) -> Iterator[Frame]:
     """Every `STRIDE`-th tick as an RGB image (H, W, 3)."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -254,7 +261,7 @@ def video_frames(ticks: Sequence[Tick], robot: RobotSpec) -> Iterator[Frame]:
         for artist in (*scene.collections, *(image for axes in images for image in axes.images)):
             artist.remove()
         draw_scene(scene, ticks[i], meshes, robot)
-        shown = (ticks[i].depth / 1000.0, imagined_of(ticks, i))
+        shown = (ticks[i].depth / 1000.0, imagined.get(ticks[i].index))
         for axes, depth in zip(images, shown, strict=False):
             draw_depth(axes, depth, robot)
         clock.set_text(f"{ticks[i].index / robot.planner_hz:.2f} s")

@@ -8,9 +8,9 @@ import pyarrow as pa
 import pytest
 from lerobot.datasets.depth_utils import quantize_depth
 
+from egovcp.data.camera_images import camera_images
 from egovcp.data.features import parse_feature
 from egovcp.data.lerobot import EpisodeRow, VideoSpan
-from egovcp.data.pictures import camera_images
 
 
 @pytest.mark.parametrize("use_log", [True, False])
