@@ -90,8 +90,9 @@ def test_events_that_a_full_queue_rejects_arrive_later(tmp_path: Path) -> None:
             pass
         pilot = Pilot(RemotePlanner(theirs))
         pilot.send_observation(0, depth, state, ("run -> damp: emergency stop",))
-        assert [*ours.receive(1.0), *ours.receive(), *ours.receive()]
-        received: list[ObservationMessage | None] = []
+        early = [*ours.receive(1.0), *ours.receive(), *ours.receive()]
+        assert early
+        received = [decode_observation(parts) for parts in early]
         for time_ns in range(100):
             pilot.next_action()
             pilot.send_observation(time_ns, depth, state, pilot.take_events())
