@@ -7,7 +7,7 @@
 #     planner      time per plan of 1024 candidates x 4 steps x 3 iterations
 #     collect      rate of the collection on all CPU cores
 #     train_step   gradient steps and frames per second by batch size
-#     train        README's training, stopped after five minutes
+#     train        README's training, stopped after four minutes
 #     eval         success of its policy
 #     lowlevel     training rate of the low-level controller in mjlab
 # A part that fails does not stop the others; the exit code is then 1. Without a GPU all parts run on
@@ -35,13 +35,13 @@ train=(egovcp-train --dataset.root="$out/data" --output_dir="$out/policy" --tens
 eval=(egovcp-eval --policy.path="$policy" --task=all --controllers=planner,oracle
   --output_dir="$out/eval" --seed=20)
 if python -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
-  part planner 90 python benchmarks/planner.py --rounds 200 --json "$out/planner.json"
-  part collect 300 "${collect[@]}" --episodes=13600
-  part train_step 150 python benchmarks/train_step_gpu.py --root "$out/data" --batches 32 64 256 \
+  part planner 60 python benchmarks/planner.py --rounds 200 --json "$out/planner.json"
+  part collect 200 "${collect[@]}" --episodes=13600
+  part train_step 120 python benchmarks/train_step_gpu.py --root "$out/data" --batches 32 64 256 \
     --cpu_batches --rounds 5 --json "$out/train_step.json"
-  part train 330 "${train[@]}" --max_minutes=5
-  part eval 120 "${eval[@]}" --episodes=100
-  part lowlevel 180 train Egovcp-LowLevel-Unitree-G1 --env.scene.num-envs 4096 \
+  part train 270 "${train[@]}" --max_minutes=4
+  part eval 90 "${eval[@]}" --episodes=100
+  part lowlevel 120 train Egovcp-LowLevel-Unitree-G1 --env.scene.num-envs 4096 \
     --agent.max-iterations 20
 else
   echo "no GPU: sizes that only test this script"

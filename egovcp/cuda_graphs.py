@@ -53,8 +53,7 @@ class _Graph(NamedTuple):
 
 
 class GraphedFunction:
-    """A function that is captured once per shape of its arguments and mode of autocast, and then
-    replayed.
+    """A function that is captured once per argument shapes and autocast dtype, then replayed.
 
     Args:
         function: takes and returns tensors, None, or tuples of them; without synchronisation,
@@ -79,8 +78,8 @@ class GraphedFunction:
 
     def __call__(self, *arguments: Any) -> Any:
         """The results of the function."""
-        kind = next(_tensors(arguments)).device.type
-        autocast = torch.is_autocast_enabled(kind) and torch.get_autocast_dtype(kind)
+        device_type = next(_tensors(arguments)).device.type
+        autocast = torch.is_autocast_enabled(device_type) and torch.get_autocast_dtype(device_type)
         key = autocast, _shape(arguments)
         if key not in self._graphs:
             full = len(self._graphs) >= self._max_graphs
@@ -123,7 +122,7 @@ def _map(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def _shape(tree: Any) -> object:
-    """Of the key of a graph: shapes, dtypes and devices of the tensors, and all other values."""
+    """Part of a graph's key: shapes, dtypes and devices of the tensors, and all other values."""
     if not isinstance(tree, tuple):
         return (tree.shape, tree.dtype, tree.device) if isinstance(tree, Tensor) else tree
     return (type(tree), *(_shape(part) for part in tree))

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 
@@ -37,6 +38,7 @@ _WRITE_ERRNOS = (errno.EAGAIN, errno.EBADF, errno.EDQUOT, errno.EFBIG, errno.EIO
 #: Integers, without which `huggingface_hub` cannot be imported.
 _HUB_VARIABLES = ("HF_HUB_DOWNLOAD_TIMEOUT", "HF_HUB_ETAG_TIMEOUT")
 _TASK_FLAGS = tuple(f"--{name}" for name in ("task", "env.task"))  # the second is LeRobot's
+_CLASS = re.compile(r"[\w.]+:\w+")  # package.module:Class
 
 
 class EntryPoint:
@@ -102,16 +104,12 @@ class EntryPoint:
 
         Tasks are registered before the command is imported, so that it has their options.
         """
-        args, places = list(argv), 0
+        args, task_at = list(argv), self._task_place(argv)
         for i, (previous, arg) in enumerate(zip(["", *args], argv, strict=False)):
             flag, equals, value = arg.partition("=")
             is_task = flag in _TASK_FLAGS
             if not equals:
-                value, is_task = arg, previous in _TASK_FLAGS
-            takes_value = previous.startswith("--") and "=" not in previous
-            if not arg.startswith("-") and (not takes_value or previous == "--debug"):
-                value, is_task = arg, places == self._task_argument
-                places += 1
+                value, is_task = arg, previous in _TASK_FLAGS or i == task_at
             if ":" in value and is_task:
                 from egovcp.sim.tasks.registry import register_task
 
@@ -119,6 +117,21 @@ class EntryPoint:
                 names = [register_task(item) if ":" in item else item for item in items]
                 args[i] = arg.removesuffix(value) + ",".join(names)
         return args
+
+    def _task_place(self, argv: Sequence[str]) -> int | None:
+        """Index of the argument that names a task without a flag."""
+        if self._task_argument is None:
+            return None
+        bare = ["", *(arg if arg.startswith("--") and "=" not in arg else "" for arg in argv)]
+        places = [
+            i
+            for i, arg in enumerate(argv)
+            if not arg.startswith("-") and bare[i] in ("", "--debug")
+        ]
+        if len(places) > self._task_argument:
+            return places[self._task_argument]
+        # Behind a switch, which looks like a flag with a value: options are not known yet.
+        return next((i for i, arg in enumerate(argv) if _CLASS.fullmatch(arg)), None)
 
     def _print_version(self) -> int:
         from importlib import metadata

@@ -19,12 +19,12 @@ from egovcp.plan.config import (
     require_affordable,
 )
 
-_PLANNER: Final = {option.name: option for option in fields(PlannerConfig)}
+_PLANNER_FIELDS: Final = {option.name: option for option in fields(PlannerConfig)}
 
 
-def _change(option: str) -> Any:
+def _planner_override(option: str) -> Any:
     """A field that is None by default, with the bounds of this option of the planner."""
-    return field(default=None, metadata=_PLANNER[option].metadata)
+    return field(default=None, metadata=_PLANNER_FIELDS[option].metadata)
 
 
 @dataclass(frozen=True)
@@ -48,22 +48,22 @@ class PolicyOptions:
 class PlannerOptions:
     """Changes to the policy's planner."""
 
-    samples: int | None = _change("samples")
+    samples: int | None = _planner_override("samples")
     """M, candidate plans per iteration."""
-    horizon: int | None = _change("horizon")
+    horizon: int | None = _planner_override("horizon")
     """N, planning horizon, planner steps (of 40 ms for the G1)."""
     objective: Objective | None = None
     """V of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward."""
-    iterations: int | None = _change("iterations")
+    iterations: int | None = _planner_override("iterations")
     """Iterations of the search."""
-    elites: int | None = _change("elites")
+    elites: int | None = _planner_override("elites")
     """Best candidates that the next iteration is fitted to."""
-    min_std: float | None = _change("min_std")
+    min_std: float | None = _planner_override("min_std")
     """Smallest sampling standard deviation, in units of eta."""
-    action_rate_cost: float | None = _change("action_rate_cost")
+    action_rate_cost: float | None = _planner_override("action_rate_cost")
     """Coefficient of mean(((a_t - a_{t-1}) / 0.32)^2) in the cost of a step."""
-    pose_cost: float | None = _change("pose_cost")
+    pose_cost: float | None = _planner_override("pose_cost")
     """Coefficient of mean(a_t^2) in the cost of a step."""
     action_parameterization: ActionParameterization | None = None
     """How a sample becomes actions: target (move towards one target, then hold it), or random_walk

@@ -6,7 +6,8 @@ Axis letters in shapes; a module that uses others, or these for something else, 
     H depth rows (48)                                W depth columns (64)
     S proprioceptive state (74)                      A action (7)
     J joints (29)                                    M candidate plans
-    N planning horizon                               E robots, episodes or scenarios
+    N planning horizon                               P actions of a plan (`PlannerConfig.actions`)
+    E robots, episodes or scenarios
 
 Units are SI (metres, radians, seconds) unless a name says otherwise. Frames: a
 suffix ``_w`` is the world, ``_b`` the pelvis *heading* frame (origin at the pelvis,

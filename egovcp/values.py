@@ -29,7 +29,7 @@ _NULL: Final = ("null", "none", "~")
 _INTEGER: Final = re.compile(r"[+-]?[0-9]+")
 _YAML_FLOATS: Final[Mapping[Any, str]] = {".inf": "inf", "-.inf": "-inf", ".nan": "nan"}
 _INT_LIMIT: Final = 2**63
-_INT_DIGITS: Final = 20  # with a sign
+_INT_DIGITS: Final = 19  # of a number below 2^63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
 """The option that is probably meant by the name of a group such as ``--dataset``."""
 _SHOWN_OPTIONS: Final = 6
@@ -211,7 +211,7 @@ def convert(kind: Any, value: Any, name: str, default: Any = None, strict: bool 
         hint = did_you_mean(value, args) if origin is Literal and is_text else ""
         is_integer = _INTEGER.fullmatch(value) if is_text and not strict else type(value) is int
         if kind is int and is_integer:
-            hint = " of a size below 2^63"
+            hint = " between -2^63 and 2^63"
         raise WrongValue.of(name, value, kind, hint)
     return found
 
@@ -282,8 +282,9 @@ def _scalar(kind: Any, value: Any, strict: bool) -> Any:
     if isinstance(value, bool):
         return None
     if kind is int:
-        if isinstance(value, str) and len(value) <= _INT_DIGITS and _INTEGER.fullmatch(value):
-            value = int(value)
+        if isinstance(value, str) and _INTEGER.fullmatch(value):
+            digits = value.lstrip("+-0")
+            value = int(value) if len(digits) <= _INT_DIGITS else None
         return value if isinstance(value, int) and abs(value) < _INT_LIMIT else None
     if kind is float and isinstance(value, int | float | str):
         try:

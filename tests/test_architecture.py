@@ -25,11 +25,22 @@ ALLOWED = {"lerobot_robot_egovcp": ("egovcp_deploy",)}
 
 #: Part of the library -> what it must not import, anywhere in its files.
 FORBIDDEN = {
-    "egovcp/model": ("egovcp.data", "egovcp.sim", "egovcp.plan", "egovcp.log", "mujoco", "lerobot"),
-    "egovcp/plan": ("egovcp.data", "egovcp.sim", "egovcp.log", "mujoco", "lerobot", "logging"),
+    "egovcp/model": (
+        *("egovcp.data", "egovcp.robot", "egovcp.sim", "egovcp.plan", "egovcp.log"),
+        *("mujoco", "lerobot"),
+    ),
+    "egovcp/plan": (
+        *("egovcp.data", "egovcp.robot", "egovcp.sim", "egovcp.log"),
+        *("mujoco", "lerobot", "logging"),
+    ),
+    "egovcp/hub": (
+        *("egovcp.data", "egovcp.robot", "egovcp.sim", "egovcp.model", "egovcp.plan"),
+        "egovcp.log",
+    ),
     "egovcp/robot": ("egovcp.sim", "egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log"),
     "egovcp/sim": ("egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log", "torch"),
     "egovcp/data": (
+        "egovcp.robot",
         "egovcp.sim",
         "egovcp.model",
         "egovcp.plan",

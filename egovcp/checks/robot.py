@@ -60,11 +60,15 @@ def check_robot(robot: type[MujocoRobot] | str) -> RobotReport:
     except EgovcpError:
         raise
     except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        raise ConformanceError(
-            f"robot {kind.__name__}: {type(error).__name__} in {os.path.basename(place.filename)}, "
-            f"line {place.lineno}: {error}"
-        ) from error
+        modules = {base.__module__ for base in kind.__mro__}
+        for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+            module = str(frame.f_globals.get("__name__", ""))
+            if module in modules and not module.startswith("egovcp."):
+                where = f"{os.path.basename(frame.f_code.co_filename)}, line {line}"
+                raise ConformanceError(
+                    f"robot {kind.__name__}: {type(error).__name__} in {where}: {error}"
+                ) from error
+        raise  # an error of this check
 
 
 def _check(kind: type[MujocoRobot]) -> RobotReport:

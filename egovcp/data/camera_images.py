@@ -73,7 +73,7 @@ def decode_image(content: object, frame: int, key: str) -> Any:
     """The encoded image of a frame as a loaded Pillow image; raises `DataError` with `frame`."""
     if not isinstance(content, Mapping) or not content.get("bytes"):
         raise DataError.without_place(f"{key} has no image in the file", frame)
-    with tiff.open_image(content["bytes"], frame, key) as image:
+    with tiff.open_image(content["bytes"], key, frame) as image:
         image.load()
     return image
 

@@ -202,8 +202,8 @@ class StagingDir:
 
 
 def _read(path: Path) -> EncodedEpisode | None:
-    """The episode in a staged file; None if its content has not the hash in the name, or is none of
-    this version."""
+    """The episode in a staged file; None if its content does not match the hash in the file name,
+    or another version of egovcp wrote it."""
     match = _NAME.fullmatch(path.name)
     if match is None or sha256(path) != match[2]:
         return None

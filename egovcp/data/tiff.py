@@ -82,7 +82,7 @@ def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | N
 
 
 def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
-    with open_image(blob, frame, "its depth image", "a TIFF", formats=("TIFF",)) as image:
+    with open_image(blob, "its depth image", frame, "a TIFF", formats=("TIFF",)) as image:
         found = f"{image.mode} {image.height}x{image.width}"
         if image.mode.startswith("I;16") and image.size == (cols, rows):
             return np.asarray(image).astype(np.uint16)
@@ -94,13 +94,13 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
 @contextmanager
 def open_image(
     blob: bytes,
-    frame: int | None,
     name: str,
+    frame: int | None = None,
     kind: str = "an image",
     formats: tuple[str, ...] | None = None,
 ) -> Iterator[Any]:
-    """An encoded image as a Pillow image, which is decoded in the block; errors are
-    `DataError`s with `frame` set that call it ``name``."""
+    """An encoded image as a Pillow image, which is decoded in the block; errors are `DataError`s
+    that call it ``name``, with `frame` set if it is given."""
     from PIL import Image, UnidentifiedImageError  # the layout of `encode` does not need it
 
     try:

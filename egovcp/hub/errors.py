@@ -180,8 +180,8 @@ def _refusal(error: HfHubHTTPError, name: str, writing: bool, repo_type: RepoTyp
         )
     message = without_token(error.server_message or "").splitlines()
     reason = f": {message[0]}" if message else ""
-    may_pass = status >= 500 or status == 429
-    remedy = "try again later" if may_pass else f"check {name} and what is sent to it"
+    may_pass = status >= 500 or status in (408, 429)
+    remedy = "try again later" if may_pass else f"check {name}"
     return EnvironmentFailure(
         f"the Hub answers {status} {error.response.reason_phrase} at {path}{reason}; {remedy}"
     )

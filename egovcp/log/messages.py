@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Final, Literal
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,12 +215,8 @@ def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
 
 
 def _escaped(name: str) -> str:
-    """A name without the separators of a label; the inverse is `_unescaped`."""
+    """A name without the separators of a label; the inverse is `urllib.parse.unquote`."""
     return name.replace("%", "%25").replace(":", "%3A").replace(",", "%2C")
-
-
-def _unescaped(name: str) -> str:
-    return name.replace("%2C", ",").replace("%3A", ":").replace("%25", "%")
 
 
 def _named(scalars: dict[str, float]) -> bytes:
@@ -366,5 +363,5 @@ def _scene(message: Any) -> tuple[Solid, ...]:
     for (name, shape), row in zip(names, _array(message), strict=True):
         x, y, z = row[7:].tolist()
         kind: Literal["sphere", "box"] = "sphere" if shape == "sphere" else "box"
-        scene.append(Solid(_unescaped(name), kind, (x, y, z), row[:3], row[3:7]))
+        scene.append(Solid(unquote(name), kind, (x, y, z), row[:3], row[3:7]))
     return tuple(scene)

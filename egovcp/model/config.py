@@ -121,6 +121,11 @@ class WorldModelConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
 
+    @property
+    def predicts_object(self) -> bool:
+        """Whether a decoder of the object's position is trained."""
+        return self.loss.object > 0 or self.loss.multistep_object > 0
+
     def without_object(self) -> Self:
         """The same without a decoder of the object's position."""
         return replace(self, loss=replace(self.loss, object=0.0, multistep_object=0.0))

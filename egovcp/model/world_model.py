@@ -96,10 +96,9 @@ class WorldModel(nn.Module):
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = self._value_head(value.width(c.value_loss))
         self.reward_head = self._value_head(1) if c.loss.reward > 0 else None
-        predicts_object = c.loss.object > 0 or c.loss.multistep_object > 0
         with torch.random.fork_rng(devices=[]):  # the other weights start the same without it
             self.object_head = (
-                SplitMlp(state, c.units, len(OBJECT_MEAN)) if predicts_object else None
+                SplitMlp(state, c.units, len(OBJECT_MEAN)) if c.predicts_object else None
             )
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(robot.state_dim))

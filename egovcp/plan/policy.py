@@ -30,10 +30,7 @@ _NONE: Final[Array] = np.zeros(0, np.float32)
 
 
 class PolicyStep(NamedTuple):
-    """Result of a planner step for E robots; fields that a policy does not compute are empty.
-
-    P is `PlannerConfig.actions`.
-    """
+    """Result of a planner step for E robots; fields that a policy does not compute are empty."""
 
     action: Array  # (E, 7) in [-1, 1]
     plan: Array = _NONE  # (E, P, 7)
@@ -201,8 +198,7 @@ class Policy:
         expected = (self.num_envs, self.model.robot.action_dim)
         if np.shape(sent) != expected:
             raise UsageError(
-                f"actions that were sent {np.shape(sent)}: expected {expected}, for "
-                f"{self.num_envs} robots"
+                f"sent has shape {np.shape(sent)}, expected {expected}: one action per robot"
             )
         if not np.isfinite(sent).all():
             raise UsageError("the action that was sent is not finite; report what the robot took")

@@ -33,7 +33,7 @@ def test_the_commands_for_a_gpu_are_valid(tmp_path: Path) -> None:
     """The script with a GPU pretended, and each part printed instead of run."""
     text = SCRIPT.read_text(encoding="utf-8").replace("if python -c", "if true || python -c")
     text = re.sub(
-        r"^part\(\) \{.*?^\}", "part() { printf '%q ' \"${@:3}\"; echo; }", text, flags=re.M | re.S
+        r"^part\(\) \{.*?^\}", "part() { printf '%q ' \"${@:2}\"; echo; }", text, flags=re.M | re.S
     )
     printed = subprocess.run(
         ["bash", "-c", text, str(SCRIPT), str(tmp_path / "out")],
@@ -41,7 +41,9 @@ def test_the_commands_for_a_gpu_are_valid(tmp_path: Path) -> None:
         text=True,
         check=True,
     ).stdout
-    commands = [shlex.split(line) for line in printed.splitlines()]
+    parts = [shlex.split(line) for line in printed.splitlines()]
+    assert sum(int(limit) for limit, *_ in parts) <= 15 * 60
+    commands = [command for _, *command in parts]
     assert [command[0] for command in commands] == [
         "python",
         "egovcp-collect",

@@ -304,7 +304,7 @@ def test_a_value_of_the_wrong_type_is_refused_by_name(flag: str, message: str) -
     ("flag", "expected"),
     [
         ("--count=many", "int"),
-        ("--count=100000000000000000000", "int of a size below 2^63"),
+        ("--count=100000000000000000000", "int between -2^63 and 2^63"),
         ("--loud=1", "true or false"),
         ("--sizes=1,2,3", "[int, int, int]"),
         ("--lamp.stand.height_range=3", "[float, float]"),

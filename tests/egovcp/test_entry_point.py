@@ -164,6 +164,7 @@ def test_log_messages_are_escaped(run: Run) -> None:
         (["check", "--env.task=my:Task"], "my:Task"),
         (["check", "--json", "-", "my:Task"], "my:Task"),
         (["check", "--debug", "my:Task"], "my:Task"),
+        (["play", "--log.rrd", "my:Task"], "my:Task"),
     ],
 )
 def test_only_the_argument_of_a_task_names_one(

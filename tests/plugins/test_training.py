@@ -208,11 +208,15 @@ def test_weights_of_another_return_are_refused_for_training(
         make_policy(config, ds_meta=meta)
 
 
-def test_object_losses_of_a_policy_without_object_head_are_refused(artifact: Path) -> None:
+def test_object_losses_without_object_head_are_refused_for_training(
+    artifact: Path, meta: LeRobotDatasetMetadata
+) -> None:
     flags = ["--world_model.loss.multistep_object=1"]
     config = PreTrainedConfig.from_pretrained(artifact, cli_overrides=flags)
     with pytest.raises(UsageError, match=r"no object head .*\.loss\.multistep_object=0"):
-        EgovcpPolicy.from_pretrained(artifact, config=config)
+        EgovcpPolicy.from_pretrained(artifact, config=config, dataset_meta=meta)
+    evaluated = EgovcpPolicy.from_pretrained(artifact, config=config)
+    assert not evaluated.config.world_model.predicts_object
     assert config.world_model.loss.multistep_object == 1
 
 

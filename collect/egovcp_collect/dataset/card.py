@@ -13,7 +13,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.data.destination import require_outside
-from egovcp.data.provenance import source_provenances
+from egovcp.data.provenance import Provenance, source_provenances
 from egovcp.data.source import hub_cache
 from egovcp.errors import UsageError
 from egovcp.files import user_path, write_text
@@ -93,8 +93,15 @@ def print_missing_licence(reader: DatasetReader) -> None:
 
 def _origin(reader: DatasetReader) -> str:
     """`Provenance.origin`; empty if it is not known, or not that of all merged datasets."""
-    origins = {part.origin for part in source_provenances(reader.origin)}
+    parts = source_provenances(reader.origin)
+    origins = {part.origin or _origin_by_command(part) for part in parts}
     return origins.pop() if len(origins) == 1 else ""
+
+
+def _origin_by_command(part: Provenance) -> str:
+    """That of a dataset from before origins were recorded: only egovcp-collect records a seed."""
+    is_collected = part.seed is not None and part.command.startswith("egovcp-collect ")
+    return "simulated" if is_collected else ""
 
 
 def _statistics(reader: DatasetReader) -> DatasetStatistics | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shlex
 from collections import Counter
@@ -16,8 +15,9 @@ import numpy as np
 from egovcp.errors import DataError, UsageError
 from egovcp.files import user_path
 from egovcp.log.mcap_reader import RecordingReader
-from egovcp.log.messages import Topic
+from egovcp.log.messages import TEMPERATURE_SENSORS, Topic
 from egovcp.log.tick import MODES, MotorReadings
+from egovcp.manifest import finite_or_null
 from egovcp.outputs import STDOUT, output_file, require_not_input, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
@@ -26,7 +26,6 @@ from egovcp.terminal import echo, echo_lines
 _MODE: Final = "|".join(MODES)
 _CHANGE: Final = re.compile(rf"(?P<before>{_MODE}) -> (?P<after>{_MODE}): (?P<reason>.*)")
 _SHOWN_GAPS: Final = 10
-_TEMPERATURES: Final = ((), (NUM_JOINTS, 1), (NUM_JOINTS, 2))  # shapes; empty: not reported
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
     joint_maxima = None
     if np.isfinite(torque).any():
         joint_maxima = {
-            name: {"torque_nm": _finite(most), "temperature_deg_c": _finite(degrees)}
+            name: finite_or_null({"torque_nm": most, "temperature_deg_c": degrees})
             for name, most, degrees in zip(
                 JOINT_NAMES, torque.tolist(), temperature.tolist(), strict=True
             )
@@ -109,17 +108,13 @@ def summarise(path: Path) -> tuple[dict[str, Any], RecordingReader]:
 
 def _require_joints(motors: MotorReadings, tick: int) -> None:
     """Raise `DataError` unless the readings are those of a G1's motors."""
-    temperatures = () if motors.temperature is None else motors.temperature.shape
-    if motors.torque.shape != (NUM_JOINTS,) or temperatures not in _TEMPERATURES:
+    temperatures = None if motors.temperature is None else motors.temperature.shape
+    known = (None, *((NUM_JOINTS, count) for count in TEMPERATURE_SENSORS))
+    if motors.torque.shape != (NUM_JOINTS,) or temperatures not in known:
         raise DataError(
             f"tick {tick} has torques of {len(motors.torque)} joints and temperatures of shape "
             f"{temperatures}, expected {NUM_JOINTS} joints; the recording is damaged"
         )
-
-
-def _finite(value: float) -> float | None:
-    """``value``; None, which JSON has, if it is not finite."""
-    return value if math.isfinite(value) else None
 
 
 def as_text(report: dict[str, Any]) -> list[str]:
@@ -152,10 +147,10 @@ def as_text(report: dict[str, Any]) -> list[str]:
         width = max(map(len, JOINT_NAMES))
         lines.append(f"{'joint':{width}}  max torque  max temperature")
         for name, most in report["joint_maxima"].items():
-            newtons, degrees = most["torque_nm"], most["temperature_deg_c"]
-            force = "" if newtons is None else f"{newtons:6.1f} N m"
-            heat = "" if degrees is None else f"{degrees:.0f} deg C"
-            lines.append(f"{name:{width}}  {force:10}  {heat}".rstrip())
+            torque, degrees = most["torque_nm"], most["temperature_deg_c"]
+            torque_text = "" if torque is None else f"{torque:6.1f} N m"
+            temperature_text = "" if degrees is None else f"{degrees:.0f} deg C"
+            lines.append(f"{name:{width}}  {torque_text:10}  {temperature_text}".rstrip())
     lines.append("topics")
     width = max(map(len, report["topics"]), default=0)
     for topic, each in report["topics"].items():

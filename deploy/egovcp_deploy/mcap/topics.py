@@ -257,7 +257,7 @@ def _image(fields: Mapping[str, Any]) -> Array:
     data = fields["data"]
     data = base64.b64decode(data) if isinstance(data, str) else bytes(data)
     if "format" in fields:
-        with open_image(data, None, "it") as image:
+        with open_image(data, "its data") as image:
             if image.mode.startswith("I"):
                 return np.asarray(image).astype(np.uint16)[..., None]
             return np.asarray(image.convert("RGB"))

@@ -54,8 +54,8 @@ class Limits:
     state_hold_s: float = bounded(0.1, above=0)
     """HOLD when proprioception is older, s."""
     state_damp_s: float = bounded(0.2, above=0)
-    """DAMP when proprioception is older, s. Above 0.5, readings that were rejected as implausible
-    are accepted before, if they agree with each other."""
+    """DAMP when proprioception is older, s. Above 0.5, readings first rejected as implausible are
+    accepted again before DAMP if they are consistent."""
     image_hold_s: float = bounded(0.2, above=0)
     """HOLD when the depth image is older, s."""
     planner_hold_s: float = bounded(0.14, above=0)
@@ -115,10 +115,12 @@ class Supervisor:
         """Apply ``facts`` and the operator's ``request``; returns log lines of what changed."""
         if self._since_ns is None:
             self._since_ns = facts.time_ns
-        before, reason, self._events = self.state, self.reason, list[str]()
+        before, self._events = self.state, list[str]()
         if self.state is not State.DAMP:
             self._step(facts, request)
-        if (self.state, self.reason) != (before, reason):
+        elif request in _TRANSITIONS:
+            self._refuse(request, "the motors stay damped; start the program again")
+        if self.state is not before:
             self._events.append(f"{before} -> {self.state}: {self.reason}")
         return tuple(self._events)
 
@@ -169,11 +171,14 @@ class Supervisor:
     def _run_or_hold(self, facts: Facts, request: OperatorRequest | None) -> None:
         fault = self._hold_reason(facts)
         if request is OperatorRequest.HOLD:
-            self._hold_requested, self.reason = True, _REQUESTED
+            if self.state is State.HOLD and not self._hold_requested:
+                self._events.append("hold requested by the operator")
+            self._hold_requested = True
         elif request is OperatorRequest.RUN and self.state is State.HOLD:
             self._hold_requested = False
-            pending = f"run requested, begins after {self.limits.recover_s:g} s without a fault"
-            self.reason = f"{pending}; now: {fault}" if fault else pending
+            now = f"; now: {fault}" if fault else ""
+            follows = f"RUN follows {self.limits.recover_s:g} s without a fault"
+            self._events.append(f"run requested; {follows}{now}")
         elif request is not None:
             self._refuse(request, f"the robot is in {self.state}")
         if reason := _REQUESTED if self._hold_requested else fault:

@@ -41,7 +41,7 @@ POSITION_UPPER: Final = JOINT_UPPER + _POSITION_MARGIN
 WINDOW_S: Final = 0.05
 #: Inconsistent readings that agree with each other for this long are accepted again: the robot has
 #: really moved. Longer than the default of `Limits.state_damp_s`, so that a standing robot is
-#: damped before; with a longer limit, it goes on with these readings.
+#: damped before; with a longer limit, the robot goes on without DAMP.
 RESYNC_S: Final = 0.5
 #: The same for readings whose speed has jumped, with positions that contradict nothing.
 JUMP_RESYNC_S: Final = 0.03

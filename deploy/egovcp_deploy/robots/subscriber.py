@@ -14,6 +14,7 @@ import contextlib
 import socket
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -211,7 +212,8 @@ class Subscriber:
             except MalformedMessage as error:
                 self._reject(str(error), now)
             except Exception as error:  # noqa: BLE001 - else no later message would be received
-                self._reject(repr(error), now)
+                place = traceback.extract_tb(error.__traceback__)[-1]
+                self._reject(f"{error!r} in {place.filename}:{place.lineno}", now)
             if time.monotonic_ns() > now + _MAX_WORK_NS:
                 return False
         return False

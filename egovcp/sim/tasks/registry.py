@@ -250,8 +250,8 @@ def find_task(name: str, option: str = "") -> type[BaseTask]:
     where = f"{option}: " if option else ""
     if ":" in name:
         raise UsageError(
-            f"{where}task {name} is not registered: give it by the flag --task={name}, not in a "
-            "file, or call egovcp.sim.tasks.register_task"
+            f"{where}task {name} is not registered: give the flag --task={name} (a file cannot "
+            "register a task), or call egovcp.sim.tasks.register_task"
         )
     known = suggest(name, task_names()) if entries else "; install egovcp again: it has no tasks"
     raise UsageError(

@@ -8,6 +8,7 @@ data are also played as they were during their training.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from egovcp.errors import UsageError
@@ -126,14 +127,14 @@ def _model(grid: Grid, part: float) -> Model:
 def _plays_during_training(grid: Grid, task: str) -> dict[int, list[str]]:
     """Gradient steps -> plays of the model of all episodes; none unless this trains it."""
     whole = _model(grid, 1.0)
-    if whole.flags:
+    if 1.0 not in grid.config.data.parts or grid.given_policy(grid.trained_on):
         return {}
     total = grid.config.train.steps
     each = int(parse_flags(grid.config.train.flags).get("save_freq", SAVE_FREQ))
     parts = [k * total // (_DURING + 1) // each * each for k in range(1, _DURING + 1)]
     steps = sorted({step for step in parts if step > 0})
-    found = {n: grid.plays(task, f"step_{n}", model=Model(step=n)) for n in steps}
-    return found | ({total: grid.plays(task)} if found else {})
+    found = {n: grid.plays(task, f"step_{n}", model=replace(whole, step=n)) for n in steps}
+    return found | ({total: grid.plays(task, whole.name, model=whole)} if found else {})
 
 
 def _lead(curves: Sequence[results.Curve], more: str, unit: str) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Iterator, Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -106,13 +107,16 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         if config is None:
             config = _read_config(artifact.path)
-        loss = config.world_model.loss
-        if artifact.world_model.object_head is None and loss.object + loss.multistep_object > 0:
-            raise UsageError(
-                f"{artifact.path} has no object head (egovcp-train does not save it), so that it "
-                "cannot be trained with object losses; give --policy.world_model.loss.object=0 and "
-                "--policy.world_model.loss.multistep_object=0"
-            )
+        if artifact.world_model.object_head is None and config.world_model.predicts_object:
+            if dataset_meta is not None:
+                raise UsageError(
+                    f"{artifact.path} has no object head (egovcp-train does not save it), so it "
+                    "cannot be trained with object losses; give "
+                    "--policy.world_model.loss.object=0 and "
+                    "--policy.world_model.loss.multistep_object=0"
+                )
+            config = copy(config)
+            config.world_model = config.world_model.without_object()
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
             artifact.require_controller(policy._reader.controller_id)

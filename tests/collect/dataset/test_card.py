@@ -121,6 +121,13 @@ def test_only_simulated_data_are_called_simulated_and_get_a_licence(
     assert DatasetCard.load(root / "README.md").data.license is None
 
 
+def test_collected_data_of_earlier_versions_are_simulated(tmp_path: Path) -> None:
+    known = Provenance("stance-1", seed=3, command="egovcp-collect --task=ball --seed=3")
+    root = write(tmp_path / "data", [0], known)
+    text = card_text(DatasetReader.open(DatasetConfig(root=str(root))), "me/earlier")
+    assert "license: apache-2.0" in text
+
+
 def test_columns_that_the_dataset_lacks_are_not_listed(
     sound: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

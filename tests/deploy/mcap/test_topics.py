@@ -190,7 +190,9 @@ def test_a_damaged_image_is_refused(
     file = foreign(damage=lambda png: png[:37] + b"\0\0\0\0" + png[41:])  # the name of a chunk
     assert _convert(tmp_path, [file]) == 3
     error = capsys.readouterr().err
-    assert "bag.mcap, frame 0: observation.images.front from /camera/front: it is not" in error
+    assert (
+        "bag.mcap, frame 0: observation.images.front from /camera/front: its data is not" in error
+    )
     assert not (tmp_path / "new").exists()
 
 

@@ -166,27 +166,34 @@ def test_a_requested_hold_ends_only_on_request() -> None:
     assert machine.state is State.RUN
 
 
-def test_a_hold_request_during_a_fault_is_logged_and_becomes_the_reason() -> None:
+def test_a_hold_request_during_a_fault_is_logged_and_outlasts_it() -> None:
     machine = at(State.RUN)
     fault = replace(WELL, image_age_s=0.5)
     assert machine.update(fault) == ("run -> hold: no new depth image for 500 ms",)
-    said = "requested by the operator"
-    assert machine.update(fault, OperatorRequest.HOLD) == (f"hold -> hold: {said}",)
+    assert machine.update(fault, OperatorRequest.HOLD) == ("hold requested by the operator",)
     assert machine.update(fault, OperatorRequest.HOLD) == (), "Ctrl-C repeats it"
     feed(machine, WELL, 5.0)
-    assert (machine.state, machine.reason) == (State.HOLD, said)
+    assert (machine.state, machine.reason) == (State.HOLD, "no new depth image for 500 ms")
 
 
 def test_a_run_request_in_hold_is_answered() -> None:
     machine = at(State.RUN)
     machine.update(WELL, OperatorRequest.HOLD)
-    pending = "hold -> hold: run requested, begins after 1 s without a fault"
+    pending = "run requested; RUN follows 1 s without a fault"
     fault = replace(WELL, image_age_s=0.5)
     (answer,) = machine.update(fault, OperatorRequest.RUN)
     assert answer == f"{pending}; now: no new depth image for 500 ms"
     assert machine.update(WELL, OperatorRequest.RUN) == (pending,)
     feed(machine, WELL, 1.1)
     assert machine.state is State.RUN
+
+
+def test_a_request_after_damp_is_refused() -> None:
+    machine = at(State.RUN)
+    machine.update(WELL, OperatorRequest.ESTOP)
+    refused = "run refused: the motors stay damped; start the program again"
+    assert machine.update(WELL, OperatorRequest.RUN) == (refused,)
+    assert machine.update(WELL, OperatorRequest.HOLD) == ()
 
 
 @pytest.mark.parametrize("state", [State.RUN, State.HOLD])

@@ -157,14 +157,19 @@ def test_frames_change_with_the_depth_image(make_tick: Any) -> None:
     assert len(np.unique(first)) > 20
 
 
-@pytest.mark.parametrize("bare", [False, True])
-def test_a_gif_has_one_frame_per_stride(tmp_path: Path, make_tick: Any, bare: bool) -> None:
-    path = tmp_path / "a.gif"
+def write_six_ticks(path: Path, make_tick: Any, bare: bool) -> Path:
+    """A video of six ticks."""
     sink = RolloutVideoSink(path)
     sink.open(RunInfo("ball"))
     for i in range(6):
         sink.write(make_tick(i, bare=bare))
     sink.close()
+    return path
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_gif_has_one_frame_per_stride(tmp_path: Path, make_tick: Any, bare: bool) -> None:
+    path = write_six_ticks(tmp_path / "a.gif", make_tick, bare)
     with Image.open(path) as image:
         assert image.size == SIZE
         assert image.info["duration"] == 80
@@ -186,12 +191,7 @@ def test_a_gif_has_the_speed_of_the_robot(
 
 
 def test_an_mp4_has_the_same_frames(tmp_path: Path, make_tick: Any) -> None:
-    path = tmp_path / "a.mp4"
-    sink = RolloutVideoSink(path)
-    sink.open(RunInfo("ball"))
-    for i in range(6):
-        sink.write(make_tick(i, bare=False))
-    sink.close()
+    path = write_six_ticks(tmp_path / "a.mp4", make_tick, bare=False)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height) == SIZE

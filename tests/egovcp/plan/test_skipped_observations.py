@@ -152,7 +152,7 @@ def test_advance_refuses_an_action_that_is_not_finite() -> None:
     policy, _ = _play(None, range(1))
     with pytest.raises(UsageError, match="not finite"):
         policy.advance(np.full((ROBOTS, A), np.nan))
-    with pytest.raises(UsageError, match=r"\(7,\): expected \(3, 7\)"):
+    with pytest.raises(UsageError, match=r"shape \(7,\), expected \(3, 7\)"):
         policy.advance(np.zeros(A))
 
 

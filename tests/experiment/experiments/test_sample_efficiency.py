@@ -14,6 +14,7 @@ from egovcp.errors import UsageError
 from egovcp.files import write_json
 from egovcp_experiment.cell import TRAIN, CellOutput
 from egovcp_experiment.config import (
+    SCALES,
     DataConfig,
     ExperimentConfig,
     PpoBaselineConfig,
@@ -81,6 +82,9 @@ def test_the_default_model_is_played_as_it_was_during_its_training() -> None:
     assert "gradient steps" in page.plot.svg
     given = replace(CONFIG, train=TrainingConfig(seeds=(0,), policies={"wall": "a/wall"}))
     assert not [name for name in plays(given) if "step_" in name]
+    paper = SCALING.cells(replace(SCALES["paper"](), tasks=("wall",)))
+    during = [cell.name for cell in paper if "step_" in cell.name and cell.name.endswith("s0")]
+    assert during == [f"play-wall-step_{n}-s0" for n in (25_000, 50_000, 75_000)]
     flags = ("--save_freq=2000",)
     rare = replace(CONFIG, train=TrainingConfig(seeds=(0,), flags=flags))
     assert [name for name in plays(rare) if "step_" in name] == ["play-wall-step_2000-s0"]
