@@ -254,7 +254,7 @@ def test_a_task_is_registered_by_reference(tmp_path: Path, monkeypatch: pytest.M
     assert "post" not in task_names()
     with pytest.raises(UsageError, match=r"unknown task 'post'.*needs that package"):
         find_task("post")
-    with pytest.raises(UsageError, match="give it by the flag --task=post_task:PostTask"):
+    with pytest.raises(UsageError, match="give the flag --task=post_task:PostTask"):
         find_task("post_task:PostTask")
     assert register_task("post_task:PostTask") == "post" == register_task("post_task:PostTask")
     assert find_task("post").description == "leave a post alone"
