@@ -13,8 +13,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from egovcp.artifact import policy_folder
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
-from egovcp.files import sha256, user_path
+from egovcp.files import sha256
 from egovcp.manifest import MANIFEST, SEAL, read_manifest
 from egovcp.reactive import ReactiveNetwork
 
@@ -141,8 +142,8 @@ def checkpoint_artifact(step: int) -> str:
 
 
 def external_digest(path: str) -> str:
-    """SHA-256 of an artifact, dataset or file; of a dataset of other tools only of its path."""
-    folder = user_path(path)
+    """SHA-256 of a policy, dataset or file; of a dataset of other tools only of its path."""
+    folder = policy_folder(path)
     if (folder / MANIFEST).is_file():
         return _artifact_digest(folder)
     if (folder / HASHES_PATH).is_file():

@@ -12,7 +12,7 @@ from typing import Final
 
 import draccus
 
-from egovcp.artifact import load_artifact
+from egovcp.artifact import load_artifact, shipped_policies
 from egovcp.cli import parse_config, preset_defaults
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError
@@ -89,7 +89,8 @@ def execute(config: ExperimentConfig, argv: Sequence[str]) -> None:
 
 def with_local_policies(config: ExperimentConfig) -> ExperimentConfig:
     """Refuse unusable `data.roots` and `train.policies` before any cell runs; policies become
-    folders, those on the Hub of a download, so that all cells use the same commit.
+    folders, those on the Hub of a download, so that all cells use the same commit. Shipped ones
+    keep their names.
 
     Raises:
         UsageError: a folder is not named, or a dataset is of another task or robot.
@@ -111,7 +112,8 @@ def with_local_policies(config: ExperimentConfig) -> ExperimentConfig:
     policies = {}
     for task, path in config.train.policies.items():
         with _naming(f"--train.policies: {task}"):
-            policies[task] = str(load_artifact(path).path)
+            folder = load_artifact(path).path
+            policies[task] = path if path in shipped_policies() else str(folder)
     return replace(config, train=replace(config.train, policies=policies))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from egovcp import packages
-from egovcp.artifact import save_artifact
+from egovcp.artifact import PRETRAINED, save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import EnvironmentFailure
 from egovcp.manifest import SEAL, read_manifest
@@ -147,6 +147,17 @@ def test_a_policy_on_the_hub_is_that_of_one_download(
     cell = cells["play-ball-default-s0"]
     assert f"--policy.path={commit}" in (store := CellStore(tmp_path / "out")).prepare(cell)
     seal = read_manifest(commit)[SEAL]
+    assert store.settings(cell)["flags"]["policy.path"] == {"sha256": seal}
+
+
+def test_a_shipped_policy_keeps_its_name_and_is_identified_by_its_content(tmp_path: Path) -> None:
+    config = replace(
+        SCALES["smoke"](), train=TrainingConfig(seeds=(0,), policies={"all": "contact"})
+    )
+    cells = {c.name: c for c in EXPERIMENTS["generalise"].cells(with_local_policies(config))}
+    cell = cells["play-ball-default-s0"]
+    assert "--policy.path=contact" in (store := CellStore(tmp_path / "out")).prepare(cell)
+    seal = read_manifest(PRETRAINED / "contact")[SEAL]
     assert store.settings(cell)["flags"]["policy.path"] == {"sha256": seal}
 
 
