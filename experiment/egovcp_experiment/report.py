@@ -20,6 +20,7 @@ INTERVALS: Final = (
     "In brackets and bands: 95 % intervals over scenarios, which do not include how trainings "
     "differ by their seeds. The rows of a table play the same scenarios; differences are paired."
 )
+_ORIGIN: Final = "How each number was made"
 _DIGITS: Final = 12  # of a shortened hash
 _STYLE: Final = """
 body { font: 15px/1.45 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222; }
@@ -187,7 +188,7 @@ def _origin(records: Mapping[str, Record], command: str) -> list[Part]:
         (
             name,
             f"{record['minutes']:.1f}",
-            record["date"],
+            record["date"][:10],
             f"`{record['settings_sha256'][:_DIGITS]}`",
             f"`{record['sha256'][:_DIGITS]}`",
             f"`{record['command']}`",
@@ -206,7 +207,8 @@ def _origin(records: Mapping[str, Record], command: str) -> list[Part]:
 def _markdown(report: ExperimentReport, origin: Sequence[Part], stem: str) -> str:
     def convert(part: Part) -> str:
         if isinstance(part, Plot):
-            return f"![{part.caption}]({stem}-{part.name}.svg)\n\n*{part.caption}*"
+            alt = f"{stem} {part.name}".replace("-", " ")
+            return f"![{alt}]({stem}-{part.name}.svg)\n\n*{part.caption}*"
         if isinstance(part, str):
             return part
         lines = [part.head, ("---",) * len(part.head), *part.rows]
@@ -217,7 +219,8 @@ def _markdown(report: ExperimentReport, origin: Sequence[Part], stem: str) -> st
     lead = " ".join(report.lead)
     plot = [convert(report.plot)] if report.plot else []
     findings = "\n".join(f"- {line}" for line in report.findings)
-    sections = [convert(part) for part in (*report.sections, *origin)]
+    made = f"## {_ORIGIN}"
+    sections = [convert(part) for part in (*report.sections, made, *origin)]
     blocks = [f"# {report.title}", lead, *plot, report.note, findings, *sections]
     return "\n\n".join(block for block in blocks if block) + "\n"
 
@@ -246,7 +249,7 @@ def _html(report: ExperimentReport, origin: Sequence[Part]) -> str:
         f"<title>{title}</title><style>{_STYLE}</style></head><body>\n<h1>{title}</h1>\n"
         f'<div class="lead">{lead}</div>\n{plot}\n{note}\n<ul>{findings}</ul>\n'
         + "\n".join(map(convert, report.sections))
-        + "\n<details><summary>How each number was made</summary>\n"
+        + f"\n<details><summary>{_ORIGIN}</summary>\n"
         + "\n".join(map(convert, origin))
         + "\n</details>\n</body></html>\n"
     )

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from egovcp.plan import PlannerConfig
 from egovcp_experiment import results
 from egovcp_experiment.experiments.table1 import MODELS
 from egovcp_experiment.grid import DEFAULT, Grid, Model
@@ -14,6 +15,8 @@ from egovcp_experiment.report import ExperimentReport, Plot, Table, draw, number
 from egovcp_experiment.studies.behaviour import NEAR_START_M
 from egovcp_experiment.studies.open_loop import HORIZONS
 
+#: Ticks ahead of the open-loop errors in the lead: the horizon of the planner, and the last.
+_AHEAD: Final = (PlannerConfig().horizon, HORIZONS[-1])
 #: Of `table1`.
 _ARWM: Final = Model("arwm", MODELS["arwm"])
 
@@ -73,8 +76,8 @@ def _add_value_maps(page: ExperimentReport, found_by_title: Results) -> None:
     if {"before", "75%"} <= summary.keys():
         before, late = (summary[name]["height_error_m"] for name in ("before", "75%"))
         page.lead.append(
-            f"The best point of a hand's value map is {100 * before:.0f} cm off the ball's height "
-            f"before the throw and {100 * late:.0f} cm at 75 % of the flight."
+            f"The hand position of the highest value is {100 * before:.0f} cm above or below the "
+            f"ball's height before the throw, and {100 * late:.0f} cm at 75 % of the flight."
         )
 
 
@@ -122,8 +125,7 @@ def _map_plot(found: Mapping[str, Any]) -> Plot:
 
 
 def _add_open_loop(page: ExperimentReport, found_by_title: Results) -> None:
-    last = str(HORIZONS[-1])
-    ahead = []
+    ahead: dict[int, list[str]] = {k: [] for k in _AHEAD}
     for task, found in found_by_title.items():
         errors = found["errors_m"]
         head = (
@@ -144,13 +146,16 @@ def _add_open_loop(page: ExperimentReport, found_by_title: Results) -> None:
                 page.plot = plot
             else:
                 page.sections.append(plot)
-        if errors[last]["model"] is not None:
-            model, repeat = (_centimetres(errors[last][name]) for name in ("model", "repeat"))
-            ahead.append(f"{model} cm of {task} ({repeat} cm)")
-    if ahead:
+        for k, words in ahead.items():
+            error = errors[str(k)]
+            if error["model"] is not None:
+                model, repeat = (_centimetres(error[name]) for name in ("model", "repeat"))
+                words.append(f"{task} {model} cm ({repeat} cm)")
+    lines = [f"{k} ticks ahead {', '.join(words)}" for k, words in ahead.items() if words]
+    if lines:
         page.lead.append(
-            f"{last} ticks ahead, the depth error over all valid pixels, and that of repeating the "
-            f"last image, is {', '.join(ahead)}."
+            "The mean error of imagined depth (in brackets: of repeating the last image) is "
+            f"{'; '.join(lines)}."
         )
 
 

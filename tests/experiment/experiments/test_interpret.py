@@ -80,7 +80,10 @@ def test_open_loop_errors_of_all_pixels_lead() -> None:
     metrics = {"episodes": 3, "errors_m": {str(k): row for k in HORIZONS}, "strips": strips}
     found = {f"open_loop-{task}": {"metrics": metrics} for task in ("ball", "arch")}
     made = EXPERIMENTS["interpret"].report(SCALES["small"](), found)
-    assert made.lead[0].endswith("is 10.0 cm of ball (20.0 cm), 10.0 cm of arch (20.0 cm).")
+    assert made.lead[0].endswith(
+        "is 4 ticks ahead ball 10.0 cm (20.0 cm), arch 10.0 cm (20.0 cm); "
+        "16 ticks ahead ball 10.0 cm (20.0 cm), arch 10.0 cm (20.0 cm)."
+    )
     assert made.plot is not None
     assert made.plot.name == "open-loop-ball"
     assert [part.name for part in made.sections if isinstance(part, Plot)] == ["open-loop-arch"]
