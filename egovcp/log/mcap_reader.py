@@ -47,10 +47,13 @@ class Recording:
     """False if the end is missing (killed process, full disk) or a part is damaged."""
 
 
-def read_recording(path: Path, damaged_ok: bool = True) -> Recording:
-    """Read all readable ticks of ``path``; raises `DataError` for damage without ``damaged_ok``."""
+def read_recording(
+    path: Path, damaged_ok: bool = True, topics: Collection[str] | None = None
+) -> Recording:
+    """Read all readable ticks of ``path``, or only ``topics`` of them; raises `DataError` for
+    damage without ``damaged_ok``."""
     reader = RecordingReader(path)
-    ticks = [raw.tick() for raw in reader.raw_ticks()]
+    ticks = [raw.tick(topics) for raw in reader.raw_ticks()]
     if not damaged_ok:
         reader.require_undamaged()
     return Recording(reader.info, ticks, reader.complete)

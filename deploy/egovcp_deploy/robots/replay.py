@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 
 from egovcp.errors import DataError, UsageError
 from egovcp.log.async_sink import warn_on_stderr
-from egovcp.log.mcap_reader import read_recording
+from egovcp.log.mcap_reader import ROW_TOPICS, read_recording
+from egovcp.log.messages import Topic
 from egovcp.log.tick import CONTROLLER
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
 RECORDING_ENDS: Final = "recording ends"
+#: Topics that are played back; plans and predictions take much more memory.
+_TOPICS: Final = ROW_TOPICS | {Topic.BASE, Topic.SCENE}
 
 
 class ReplayRobot:
@@ -44,7 +47,7 @@ class ReplayRobot:
         if it is damaged or of another low-level controller."""
         if episode != self._number:
             path = self.files[episode]
-            recording = read_recording(path, damaged_ok=False)
+            recording = read_recording(path, damaged_ok=False, topics=_TOPICS)
             if not recording.ticks:
                 raise DataError(f"{path} has no ticks; there is nothing to play back")
             info = recording.info

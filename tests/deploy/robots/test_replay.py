@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from egovcp.artifact import load_artifact
 from egovcp.errors import DataError, UsageError
 from egovcp.log.mcap import McapSink
-from egovcp.log.mcap_reader import read_recording
+from egovcp.log.mcap_reader import Recording, read_recording
 from egovcp.log.tick import RunInfo, Sink, Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.sim.config import EnvConfig, EpisodeConfig
@@ -111,6 +112,23 @@ def test_replay_repeats_the_recurrence_bit_for_bit(
     for a, b in zip(again.carries, then.carries, strict=True):
         assert torch.equal(a, b)
     assert again.values == then.values
+
+
+def test_replay_does_not_keep_plans_in_memory(
+    recorded: tuple[Path, list[Watched]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = recorded[0] / "rollout-0.mcap"
+    assert any(tick.candidates is not None for tick in read_recording(path).ticks)
+    read = []
+
+    def spy(*args: Any, **options: Any) -> Recording:
+        read.append(read_recording(*args, **options))
+        return read[-1]
+
+    monkeypatch.setattr("egovcp_deploy.robots.replay.read_recording", spy)
+    open_recordings(path)
+    for tick in read[0].ticks:
+        assert (tick.candidates, tick.plan, tick.depth_imagined) == (None, None, None)
 
 
 def test_replay_returns_everything_recorded(
