@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import mujoco
@@ -205,8 +206,15 @@ class BaseTask(ABC):
 
     @property
     def success(self) -> bool:
-        """Whether the task would count as achieved if the episode ended now."""
-        return bool(self.achieved) and not self.fallen
+        """Whether the task would count as achieved if the episode ended now.
+
+        Raises:
+            EnvironmentFailure: `achieved` of the task is no truth value.
+        """
+        achieved: Any = self.achieved
+        if not isinstance(achieved, bool | np.bool_):
+            raise self.error(f"its achieved is {achieved!r}; expected True or False")
+        return bool(achieved) and not self.fallen
 
     @property
     def parts(self) -> dict[str, bool]:
@@ -225,10 +233,14 @@ class BaseTask(ABC):
         """Reward terms of the planner tick in which ``action`` (A,) was sent.
 
         Raises:
-            EnvironmentFailure: the task returns other terms than it declares, or not finite ones.
+            EnvironmentFailure: the task returns other terms than it declares, or values that are
+                no finite numbers.
         """
         was_fallen, self.fallen = self.fallen, self.fallen or self.has_fallen()
-        terms = self.rewards()
+        rewards: Any = self.rewards()
+        if not isinstance(rewards, dict):
+            raise self.error(f"its rewards are {rewards!r}; expected a dict, reward term -> number")
+        terms: dict[str, float] = dict(rewards)
         terms["fall"] = -self.fall_cost if self.fallen and not was_fallen else 0.0
         terms["pose"] = -self._pose_cost * float(np.mean(action**2))
         change = (action - self._last_action) / ACTION_RATE_LIMIT
@@ -238,8 +250,11 @@ class BaseTask(ABC):
             found = ", ".join(terms)
             raise self.error(f"its rewards are {found}; expected {', '.join(self.reward_terms)}")
         for name, value in terms.items():
-            if not math.isfinite(value):
-                raise self.error(f"its reward term {name} is {value} after {self.time:.2f} s")
+            if not isinstance(value, Real) or not math.isfinite(value):
+                raise self.error(
+                    f"its reward term {name} is {value} after {self.time:.2f} s; expected a finite "
+                    "number"
+                )
         return terms
 
     @abstractmethod

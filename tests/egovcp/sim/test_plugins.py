@@ -153,6 +153,10 @@ def test_a_late_state_that_is_not_finite_is_named(
             '{"touch": float("nan")}',
             r"its reward term touch is nan after 0\.04 s",
         ),
+        ('{"touch": 0.25}', '{"touch": None}', "its reward term touch is None .* finite number"),
+        ('{"touch": 0.25}', '{"touch": np.ones(1)}', r"its reward term touch is \[1\.\] "),
+        ('{"touch": 0.25}', "None", "its rewards are None; expected a dict, reward term -> number"),
+        ("return True", "pass", "its achieved is None; expected True or False"),
         ('{"touch": 0.25}', "{}", "its rewards are fall, pose, action_rate; expected touch,"),
         ("size=[0.1, 1, 0]", "size=[0, 0, 0]", "its scene does not compile: .*size"),
         (
